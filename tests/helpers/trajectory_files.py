@@ -10,6 +10,7 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
 from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
@@ -56,6 +57,33 @@ def trajectories(draw: st.DrawFn, largest: float | None = None) -> Trajectory:
         phases.append(PhaseSpan(draw(label), first, last, tuple(holds)))
         first = last
     return Trajectory(names, times, rows, tuple(phases), robot)
+
+
+@st.composite
+def curved_trajectories(draw: st.DrawFn) -> Trajectory:
+    """Return smooth motions of four coordinates from rest to rest, some of which rest between.
+
+    Cubics last 10 ms to 1 s, and accelerations jump at their knots.
+    """
+    count = draw(st.integers(2, 7))
+    durations = draw(st.lists(st.floats(0.01, 1.0), min_size=count - 1, max_size=count - 1))
+    rng = np.random.default_rng(draw(st.integers(0, 10_000)))
+    times = np.cumsum([0.0, *durations])
+    rates = rng.uniform(-1.0, 1.0, (count, 4))
+    rates[[0, -1]] = 0.0
+    # Means of neighbouring velocities, plus what makes accelerations jump.
+    means = (rates[1:] + rates[:-1]) / 2.0 + rng.uniform(-0.1, 0.1, (count - 1, 4))
+    rest = draw(st.none() | st.integers(0, count - 2))
+    if rest is not None:
+        rates[[rest, rest + 1]] = means[rest] = 0.0
+    steps = means * np.diff(times)[:, None]
+    positions = np.concatenate([np.zeros((1, 4)), np.cumsum(steps, axis=0)])
+    names = ("base_x", "base_y", "base_yaw", "lift")
+    inner = draw(st.sets(st.integers(1, count - 1))) | {count - 1}
+    waypoints = [0, *sorted(inner)]
+    phases = (PhaseSpan("move", 0, len(waypoints) - 1),)
+    curve = Curve(times, positions, rates)
+    return Trajectory(names, times[waypoints], positions[waypoints], phases, 4, curve)
 
 
 def are_equal(one: Trajectory, other: Trajectory) -> bool:

@@ -449,7 +449,7 @@ def _add_view_and_export(commands: Any) -> None:
     groups = ", ".join(GROUPS)
     about = f"{groups}, or names separated by commas (default: all; for ROS the robot's)"
     add_option(export, "--joints WHICH", about)
-    about = "frequency of the points for ROS (default: waypoints)"
+    about = "smallest frequency of the points for ROS (default: the motion's knots)"
     add_option(export, "--rate HZ", about, type=float)
 
 

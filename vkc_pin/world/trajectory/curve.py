@@ -144,14 +144,21 @@ class Curve:
         strongest = np.max(np.abs([2.0 / h * (middle - first), 2.0 / h * (last - middle)]), axis=0)
         return np.asarray(fastest), np.asarray(strongest)
 
+    def compute_accelerations(self) -> tuple[Floats, Floats]:
+        """Compute the accelerations at the begin and the end of each cubic, (K − 1, n) each."""
+        h = np.diff(self.times)[:, None]
+        p, c, d, q = self._control(np.arange(len(h)))
+        begin = 6.0 / h**2 * ((d - c) - (c - p))
+        end = 6.0 / h**2 * ((q - d) - (d - c))
+        return begin, end
+
     def compute_jerks(self) -> tuple[Floats, Floats]:
         """Compute |jerk| of each cubic, shape (K − 1, n), and acceleration jumps at knots, (K, n).
 
         Before the first and after the last knot the motion is at rest.
         """
         h = np.diff(self.times)[:, None]
-        p, c, d, q = self._control(np.arange(len(h)))
-        begin, end = (6.0 / h**2 * part for part in ((d - c) - (c - p), (q - d) - (d - c)))
+        begin, end = self.compute_accelerations()
         none = np.zeros((1, self.positions.shape[1]))
         jumps = np.concatenate([begin, none]) - np.concatenate([none, end])
         return np.abs(end - begin) / h, np.abs(jumps)

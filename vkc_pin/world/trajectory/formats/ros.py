@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.errors import InputError, format_value
+from vkc_pin.errors import InputError, UnknownNameError, format_value
 from vkc_pin.utils.arguments import check_bool, check_integer, check_number, check_text, is_number
-from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.world.files.resources import check_path
-from vkc_pin.world.trajectory.curve import Curve, sample_evenly
+from vkc_pin.world.trajectory.curve import MIN_INTERVAL, Curve, sample_evenly
+from vkc_pin.world.trajectory.formats.interpolation import interpolate_points
 from vkc_pin.world.trajectory.formats.tables import (
     infer_robot_size,
     make_single_phase,
@@ -24,11 +25,12 @@ from vkc_pin.world.trajectory.formats.tables import (
     select_columns,
 )
 
-__all__ = ["estimate_rates", "evaluate_cubics", "from_ros", "to_ros"]
+__all__ = ["from_ros", "sample_states", "to_ros"]
 
 _MAX_VALUES = 1_000_000  # positions in a message: some 300 MB
 _NANO = 1_000_000_000
-_MIN_GAP = 1e-4  # [s] between sampled times and the ends of rests, which replace closer samples
+_ROWS = ("positions", "velocities", "accelerations")  # of a point
+_LARGEST = 1e12  # [m], [rad] and their derivatives
 
 
 def to_ros(
@@ -43,19 +45,24 @@ def to_ros(
 ) -> dict[str, Any]:
     """Return a motion as data with the fields of ROS' `trajectory_msgs/JointTrajectory`.
 
-    Points of a motion with a curve lie on that curve, which was validated. Without a curve,
-    velocities are those of monotone cubics, on which every coordinate stays between its values at
-    neighbouring waypoints; `from_ros` converts the points to a motion that can be validated.
+    Controllers interpolate positions by lines, and cubics with velocities, which are the motion
+    itself. A motion without a curve gets velocities of monotone cubics, on which every coordinate
+    stays between its values at neighbouring waypoints.
+
+    With accelerations, controllers interpolate quintics. Where the curve's accelerations jump by
+    up to J, quintics of duration h are up to 0.04·J·h² away from it, and exceed its accelerations
+    by up to J/2: use them for motions with limits on jerk, which have no such jumps.
 
     Args:
         motion: Motion.
         joints: One of `GROUPS`, or names of coordinates in the wanted order.
-        rate: Points per second [Hz]; the end of the motion and both ends of all rests are added.
-            Default: the knots of the curve, or else the waypoints.
-        smooth: Whether points at a rate lie on cubics if there is no curve. Otherwise they lie on
-            straight lines, and velocities jump.
-        derivatives: 0: positions only; 1: velocities, too; 2: accelerations, too. Default: 1 with a
-            curve, since controllers then interpolate the same cubics, else 2.
+        rate: Smallest number of points per second [Hz]: the time between two knots of the curve, or
+            two waypoints, is divided evenly. Default: the knots of the curve, or else the
+            waypoints.
+        smooth: Whether points lie on cubics if there is no curve. Otherwise they lie on straight
+            lines, and velocities jump.
+        derivatives: 0: positions only; 1: velocities, too; 2: accelerations, too. Default: 1, or 0
+            on straight lines.
         frame: `header.frame_id`, the frame of the base's coordinates.
         stamp: `header.stamp` [s]; ROS executes a trajectory of stamp 0 at once.
 
@@ -69,44 +76,38 @@ def to_ros(
         InputError: `joints` is empty or repeats a name; `rate`, `derivatives` or `stamp` is out of
             range.
     """
-    smooth, frame = check_bool(smooth, "smooth"), check_text(frame, "frame")
-    has_curve = motion.get("curve") is not None
-    source = motion["curve"] if has_curve else motion
+    smooth = check_bool(smooth, "smooth")
+    frame = check_text(frame, "frame")
+    is_smooth = smooth or motion.get("curve") is not None
     if derivatives is None:
-        derivatives = 1 if has_curve else 2
+        derivatives = 1 if is_smooth else 0
     derivatives = check_integer(derivatives, "derivatives", low=0, high=2)
-    if (stamp := check_number(stamp, "stamp", "seconds, at least 0", low=0.0)) >= 2.0**31:
-        raise InputError(
-            "out of range", field="stamp", expected="seconds, less than 2^31", got=stamp
-        )
+    stamp = check_number(stamp, "stamp", "seconds, at least 0", low=0.0)
+    if stamp >= 2.0**31:
+        expected = "seconds, less than 2^31"
+        raise InputError("out of range", field="stamp", expected=expected, got=stamp)
     columns = select_columns(motion, joints)
-    every = np.array(source["positions"], float)
-    times, positions = np.array(source["times"], float), every[:, columns]
-    times = times - times[0]
-    moments = times
+    knots = _get_knots(motion)[0]
+    moments = knots
     if rate is not None:
-        rate = check_number(rate, "rate", "points a second, more than 0", low=0.0, strict=True)
-        most = _MAX_VALUES // max(len(columns), 1)  # a group may be empty
-        if times[-1] * rate > most:
-            expected = f"at most {most} points, {most / times[-1]:.4g} a second "
-            expected += f"for this motion of {times[-1]:.4g} s"
-            raise InputError("too many points", field="rate", expected=expected, got=rate)
-        moments = _add_rests(sample_evenly(times, rate), times, every)
-    if has_curve:
-        # At the times of the message: its cubics would else exceed limits where knots are close.
-        moments = np.minimum(np.round(moments * _NANO) / _NANO, times[-1])
-        curve = Curve(times, positions, np.array(source["rates"], float)[:, columns])
-        parts = [read(moments) for read in (curve.at, curve.velocity, curve.acceleration)]
-    elif smooth and rate is not None:
-        velocities, _ = estimate_rates(times, positions)
-        parts = [*evaluate_cubics(times, positions, velocities, moments)]
+        rate = _check_rate(rate, knots, len(columns))
+        counts = np.maximum(np.ceil(np.diff(knots) * rate - 1e-6), 1.0)
+        moments = _divide_intervals(knots, counts.astype(int))
+    if is_smooth:
+        curve = _make_curve(motion, columns)
     else:
-        rows = [np.interp(moments, times, column) for column in positions.T]
-        positions = np.reshape(rows, (len(columns), len(moments))).T
-        parts = [positions, *estimate_rates(moments, positions)]
+        lines = [np.interp(moments, knots, column) for column in _get_knots(motion)[1].T]
+        positions = np.reshape(lines, (-1, len(moments))).T[:, columns]
+        curve = Curve(moments, positions, _estimate_velocities(moments, positions))
+    # At the times of the message: its cubics would else exceed limits where knots are close.
+    stated = _round_times(moments)
+    accelerations = curve.acceleration(stated)
+    at_knots = np.searchsorted(moments, curve.times)
+    accelerations[at_knots] = _choose_accelerations(curve, _find_rests(motion, curve.times))
+    parts = [curve.at(stated), curve.velocity(stated), accelerations]
     for k in range(derivatives + 1, 3):
         parts[k] = parts[k][:, :0]
-    points = zip(moments.tolist(), *(part.tolist() for part in parts), strict=True)
+    points = zip(stated.tolist(), *(part.tolist() for part in parts), strict=True)
     return {
         "header": {"stamp": _make_duration(stamp), "frame_id": frame},
         "joint_names": [motion["names"][k] for k in columns],
@@ -123,6 +124,35 @@ def to_ros(
     }
 
 
+def sample_states(
+    motion: Mapping[str, Any], joints: str, rate: float
+) -> tuple[list[str], Floats, Floats, Floats]:
+    """Sample a motion evenly, and at the times at which it begins and ends to rest.
+
+    Args:
+        motion: Motion.
+        joints: One of `GROUPS`.
+        rate: Samples per second [Hz]. One less than half a period away from a rest is replaced.
+
+    Returns:
+        Names of the n coordinates, times from the start, shape (T,) [s], positions and velocities,
+        shape (T, n) each.
+    """
+    columns = select_columns(motion, joints)
+    knots = _get_knots(motion)[0]
+    rate = _check_rate(rate, knots, len(columns))
+    is_rest = _find_rests(motion, knots)
+    rests = knots[np.append(is_rest, False) | np.append(False, is_rest)]
+    even = sample_evenly(knots, rate)
+    half = 0.5 / rate
+    after = np.searchsorted(rests, even - half)  # the first that is not well before each
+    is_apart = np.append(rests, np.inf)[after] > even + half
+    moments = _round_times(np.union1d(even[is_apart], rests))
+    curve = _make_curve(motion, columns)
+    names = [motion["names"][k] for k in columns]
+    return names, moments, curve.at(moments), curve.velocity(moments)
+
+
 def from_ros(
     message: Mapping[str, Any] | str | Path,
     *,
@@ -131,120 +161,248 @@ def from_ros(
 ) -> dict[str, Any]:
     """Return the motion in data with the fields of `trajectory_msgs/JointTrajectory`.
 
+    The motion is that of a `joint_trajectory_controller`: see `interpolate_points`. `effort` is
+    not part of it. Without any velocities, it has no curve, and all its segments are lines.
+
     Args:
-        message: Data, or a JSON file with them, with all of the robot's coordinates, base first.
-        like: Motion with the phases, the waypoints and the number of robot coordinates. Its
+        message: Data, or a JSON file with them, with all of the robot's coordinates.
+        like: Motion with the phases, the waypoints, and the order and number of coordinates. Its
             waypoints are the points that are nearest in time; others are knots of the curve only,
-            if there are velocities. Default: one phase without holds, every point a waypoint.
+            if there are velocities. Default: one phase without holds, every point a waypoint, and
+            coordinates as in the message, base first.
         robot_size: Number of robot coordinates without `like`. Default: those before the first
             with a dot in its name.
+
+    Raises:
+        UnknownNameError: `like` has no such coordinate.
+        InputError: A field is missing or invalid, coordinates of the robot are missing, or two
+            neighbouring points have accelerations, but not both have velocities: ros2_controllers
+            4.42.1 commands the position 0 between them.
     """
     file = None
     if not isinstance(message, Mapping):
         file = check_path(message, "message", "a JointTrajectory as data, or a JSON file")
     data = message if file is None else read_json(file)
-    names = _get_field(data, "joint_names", list, file, "")
+    listed = _get_field(data, "joint_names", list, file, "")
+    order = _sort_names(listed, like, file)
+    names = [listed[k] for k in order]
+    points = _get_field(data, "points", list, file, "")
     times: list[float] = []
-    rows: list[list[float]] = []
-    rates: list[list[float]] = []
-    for k, point in enumerate(_get_field(data, "points", list, file, "")):
-        where = f"points[{k}]."
-        row = _get_field(point, "positions", list, file, where)
-        rows.append(_check_row(row, len(names), file, f"{where}positions"))
-        since, inside = _get_field(point, "time_from_start", dict, file, where), "time_from_start."
-        seconds = {
-            key: check_number(
-                _get_field(since, key, int, file, where + inside), f"{where}{inside}{key}"
-            )
-            for key in ("sec", "nanosec")
-        }
-        times.append(seconds["sec"] + seconds["nanosec"] / _NANO)
-        rate = point.get("velocities", ())
-        if isinstance(rate, list) and rate and not point.get("accelerations"):
-            rates.append(_check_row(rate, len(names), file, f"{where}velocities"))
+    rows: dict[str, list[Floats | None]] = {key: [] for key in _ROWS}
+    for k, point in enumerate(points):
+        for key, found in rows.items():
+            found.append(_read_row(point, key, order, file, k))
+        times.append(_read_time(point, file, f"points[{k}]."))
+    _check_points(times, rows, file)
     size = None if robot_size is None else check_integer(robot_size, "robot_size", low=3)
     if like is not None:
         size = like["robot_size"]
     elif size is None:
         size = infer_robot_size(names, file=file, field="joint_names")
-    has_curve = bool(rates) and len(rates) == len(rows)
-    waypoints = list(range(len(rows)))
-    phases = [make_single_phase(len(rows))] if len(rows) > 1 else []
+    has_velocity = np.array([row is not None for row in rows["velocities"]], bool)
+    has_curve = bool((has_velocity[1:] & has_velocity[:-1]).any())
+    stated = [row for row in rows["positions"] if row is not None]  # every point has some
+    positions: Floats = np.reshape(stated, (len(points), len(names)))
+    waypoints = list(range(len(points)))
     if like is not None:
-        moments = np.array(like["times"], float)
-        between = (np.array(times[1:]) + np.array(times[:-1])) / 2.0
-        at = np.searchsorted(between, moments - moments[0])  # the points that are nearest in time
-        if has_curve:
-            waypoints = np.union1d(at, [0, len(rows) - 1]).tolist()
-            at = np.searchsorted(waypoints, at)
-        edges = at[[0, *(phase["last"] for phase in like["phases"])]].tolist()
-        ends = zip(like["phases"], edges, edges[1:], strict=False)
-        phases = [{**phase, "first": first, "last": last} for phase, first, last in ends]
+        waypoints, phases = _place_phases(np.array(times), like, has_curve)
+    else:
+        phases = [make_single_phase(len(points))] if len(points) > 1 else []
     motion = {
         "names": names,
         "times": [times[k] for k in waypoints],
-        "positions": [rows[k] for k in waypoints],
+        "positions": positions[waypoints].tolist(),
         "robot_size": size,
         "phases": phases,
     }
     if has_curve:
-        motion["curve"] = {"times": times, "positions": rows, "rates": rates}
+        knots = interpolate_points(
+            np.array(times), positions, rows["velocities"], rows["accelerations"]
+        )
+        keys = ("times", "positions", "rates")
+        motion["curve"] = {key: part.tolist() for key, part in zip(keys, knots, strict=True)}
     return motion
 
 
-def _check_row(values: list[Any], size: int, file: Path | None, field: str) -> list[float]:
-    if len(values) != size:
-        raise InputError(
-            "wrong number of values", file=file, field=field, expected=size, got=len(values)
-        )
-    for k, value in enumerate(values):
-        if not is_number(value):
-            got = format_value(value)
-            raise InputError(
-                "not a number", file=file, field=f"{field}[{k}]", expected="a number", got=got
-            )
-    return values
+def _place_phases(
+    times: Floats, like: Mapping[str, Any], has_curve: bool
+) -> tuple[list[int], list[dict[str, Any]]]:
+    """Return the points that are waypoints, and the phases of another motion between them."""
+    moments = np.array(like["times"], float)
+    between = (times[1:] + times[:-1]) / 2.0
+    at = np.searchsorted(between, moments - moments[0])  # the points that are nearest in time
+    waypoints = np.arange(len(times))
+    if has_curve:
+        waypoints = np.union1d(at, waypoints[[0, -1]])
+        at = np.searchsorted(waypoints, at)
+    edges = at[[0, *(phase["last"] for phase in like["phases"])]].tolist()
+    ends = zip(like["phases"], edges, edges[1:], strict=False)
+    phases = [{**phase, "first": first, "last": last} for phase, first, last in ends]
+    return waypoints.tolist(), phases
 
 
-def _add_rests(moments: Floats, times: Floats, positions: Floats) -> Floats:
-    """Add the times at which all positions, (T, n), begin and end to rest."""
-    still = ~np.diff(positions, axis=0).any(axis=1)
-    rests = times[np.append(still, False) | np.append(False, still)]
-    after = np.searchsorted(rests, moments - _MIN_GAP)  # the first that is not well before each
-    apart = np.append(rests, np.inf)[after] > moments + _MIN_GAP
-    return np.sort(np.concatenate([moments[apart], rests]))
+def _get_knots(motion: Mapping[str, Any]) -> tuple[Floats, Floats]:
+    """Return times from the start and all positions of the curve's knots, or of the waypoints."""
+    curve = motion.get("curve")
+    source = motion if curve is None else curve
+    times = np.array(source["times"], float)
+    times -= times[0]
+    if curve is None:
+        times = np.round(times * _NANO) / _NANO  # a message then has the very same waypoints
+    return times, np.array(source["positions"], float)
 
 
-def estimate_rates(times: Floats, positions: Floats) -> tuple[Floats, Floats]:
-    """Return velocities and accelerations at waypoints, shape (T, n) each, at rest at both ends.
+def _make_curve(motion: Mapping[str, Any], columns: Sequence[int]) -> Curve:
+    """Return the curve of some coordinates, or else monotone cubics through the waypoints."""
+    times, every = _get_knots(motion)
+    positions = every[:, columns]
+    if motion.get("curve") is None:
+        return Curve(times, positions, _estimate_velocities(times, positions))
+    return Curve(times, positions, np.array(motion["curve"]["rates"], float)[:, columns])
 
-    Velocities are those of SciPy's monotone cubics; next to a rest, accelerations are zero.
+
+def _find_rests(motion: Mapping[str, Any], times: Floats) -> Bools:
+    """Return whether nothing moves, robot or object, between each of the times and the next [s]."""
+    knots, every = _get_knots(motion)
+    is_still: Bools = np.logical_not(np.diff(every, axis=0).any(axis=1))
+    if motion.get("curve") is not None:
+        at_rest = ~np.any(motion["curve"]["rates"], axis=1)
+        is_still &= at_rest[:-1] & at_rest[1:]
+    middles = (times[1:] + times[:-1]) / 2.0
+    return np.asarray(is_still[np.searchsorted(knots, middles) - 1])
+
+
+def _check_rate(rate: float, times: Floats, columns: int) -> float:
+    rate = check_number(rate, "rate", "points a second, more than 0", low=0.0, strict=True)
+    most = _MAX_VALUES // max(columns, 1)  # a group may be empty
+    duration = times[-1] - times[0]
+    if duration * rate > most:
+        expected = f"at most {most} points, {most / duration:.4g} a second "
+        expected += f"for this motion of {duration:.4g} s"
+        raise InputError("too many points", field="rate", expected=expected, got=rate)
+    return rate
+
+
+def _divide_intervals(times: Floats, counts: Ints) -> Floats:
+    """Divide the interval after each of the times but the last evenly into `counts` parts."""
+    starts = np.repeat(np.cumsum(counts) - counts, counts)
+    part = np.arange(counts.sum()) - starts
+    inside = np.repeat(times[:-1], counts) + part * np.repeat(np.diff(times) / counts, counts)
+    return np.append(inside, times[-1])
+
+
+def _round_times(times: Floats) -> Floats:
+    """Round times to those that a message can state, but not beyond the last one."""
+    return np.minimum(np.round(times * _NANO) / _NANO, times[-1])
+
+
+def _estimate_velocities(times: Floats, positions: Floats) -> Floats:
+    """Return velocities at waypoints, shape (T, n), those of SciPy's monotone cubics.
+
+    Both ends are at rest.
     """
     from scipy.interpolate import PchipInterpolator
 
-    steps = np.diff(times)[:, None]
-    slopes = np.diff(positions, axis=0) / steps
-    velocities, accelerations = np.zeros_like(positions), np.zeros_like(positions)
+    velocities = np.zeros_like(positions)
     with np.errstate(over="ignore"):  # the reciprocal of a slope next to nothing
         velocities[1:-1] = PchipInterpolator(times, positions)(times[1:-1], 1)
-    before, after = slopes[:-1], slopes[1:]
-    moves = (before != 0.0) & (after != 0.0)
-    accelerations[1:-1] = np.where(moves, 2.0 * (after - before) / (steps[1:] + steps[:-1]), 0.0)
-    return velocities, accelerations
+    return velocities
 
 
-def evaluate_cubics(
-    times: Floats, positions: Floats, velocities: Floats, moments: Floats
-) -> tuple[Floats, Floats, Floats]:
-    """Return positions, velocities and accelerations at `moments` on cubics through waypoints."""
-    from scipy.interpolate import CubicHermiteSpline
+def _choose_accelerations(curve: Curve, is_rest: Bools) -> Floats:
+    """Return one acceleration at each knot, shape (K, n), where those of the cubics jump.
 
-    cubics = CubicHermiteSpline(times, positions, velocities)
-    at = np.clip(np.searchsorted(times, moments, side="right") - 1, 0, len(times) - 2)
-    ends = np.stack([positions[at], positions[at + 1]])
-    place = np.clip(cubics(moments), ends.min(axis=0), ends.max(axis=0))  # against rounding
-    place[moments >= times[-1]] = positions[-1]
-    return place, cubics(moments, 1), cubics(moments, 2)
+    A quintic of duration h whose acceleration at one end is wrong by d is off by max s³(1−s)²/2 of
+    d·h², which is 0.0173·d·h². With accelerations a and b before and after the knot, and durations
+    h and k, both quintics are equally far off at (a·h² + b·k²)/(h² + k²). A rest remains one.
+    """
+    after, before = curve.compute_accelerations()  # at the begin and the end of each cubic
+    squares = np.diff(curve.times)[:, None] ** 2
+    chosen = np.concatenate([after[:1], before])
+    inner = before[:-1] * squares[:-1] + after[1:] * squares[1:]
+    chosen[1:-1] = inner / (squares[:-1] + squares[1:])
+    chosen[np.append(is_rest, False) | np.append(False, is_rest)] = 0.0
+    return chosen
+
+
+def _sort_names(names: list[Any], like: Mapping[str, Any] | None, file: Path | None) -> list[int]:
+    """Return the columns of a message in the order of `like`, or else as they are."""
+    for k, name in enumerate(names):
+        field = f"joint_names[{k}]"
+        if not isinstance(name, str):
+            got = format_value(name)
+            raise InputError("not text", file=file, field=field, expected="a name", got=got)
+        if name in names[:k]:
+            raise InputError("a name occurs twice", file=file, field=field, got=name)
+    if like is None:
+        return list(range(len(names)))
+    known = like["names"]
+    for k, name in enumerate(names):
+        if name not in known:
+            raise UnknownNameError("coordinate", name, known, file=file, field=f"joint_names[{k}]")
+    missing = [name for name in known[: like["robot_size"]] if name not in names]
+    if missing:
+        problem, expected = "coordinates of the robot are missing", ", ".join(missing)
+        raise InputError(problem, file=file, field="joint_names", expected=expected, got=names)
+    return sorted(range(len(names)), key=lambda k: known.index(names[k]))
+
+
+def _read_time(point: Any, file: Path | None, where: str) -> float:
+    since = _get_field(point, "time_from_start", dict, file, where)
+    inside = f"{where}time_from_start."
+    second = _get_field(since, "sec", int, file, inside)
+    nano = _get_field(since, "nanosec", int, file, inside)
+    return float(second + nano / _NANO)
+
+
+def _read_row(
+    point: Any, key: str, order: Sequence[int], file: Path | None, number: int
+) -> Floats | None:
+    """Return the positions or their derivatives at a point; none if a derivative is not stated."""
+    where = f"points[{number}]."
+    if key != "positions" and point.get(key) is None:
+        return None
+    values = _get_field(point, key, list, file, where)
+    if key != "positions" and not values:
+        return None
+    field = where + key
+    if len(values) != len(order):
+        problem, count = "wrong number of values", len(order)
+        raise InputError(problem, file=file, field=field, expected=count, got=len(values))
+    for k, value in enumerate(values):
+        if not is_number(value) or not abs(value) <= _LARGEST:
+            expected = f"a number up to {_LARGEST:g}"
+            got = format_value(value)
+            raise InputError(
+                "not a number", file=file, field=f"{field}[{k}]", expected=expected, got=got
+            )
+    return np.array([values[k] for k in order], float)
+
+
+def _check_points(
+    times: list[float], rows: Mapping[str, Sequence[Floats | None]], file: Path | None
+) -> None:
+    """Check that times increase, and that controllers can interpolate between the points."""
+    for k in range(1, len(times)):
+        where = f"points[{k}]"
+        if not times[k] - times[k - 1] >= MIN_INTERVAL / 2.0:  # half, against rounding
+            field = f"{where}.time_from_start"
+            expected = f"more than {times[k - 1]:.9f} s"
+            got = f"{times[k]:.9f} s"
+            raise InputError(
+                "times do not increase", file=file, field=field, expected=expected, got=got
+            )
+        ends = slice(k - 1, k + 1)
+        has_velocities = all(row is not None for row in rows["velocities"][ends])
+        has_accelerations = all(row is not None for row in rows["accelerations"][ends])
+        if has_accelerations and not has_velocities:
+            lacking = k if rows["velocities"][k] is None else k - 1
+            raise InputError(
+                "accelerations without velocities: ros2_controllers commands the position 0 there",
+                file=file,
+                field=f"points[{lacking}].velocities",
+                expected="velocities, or no accelerations",
+            )
 
 
 def _make_duration(seconds: float) -> dict[str, int]:

@@ -18,9 +18,10 @@ import numpy as np
 
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import check_number, check_text
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.optional_imports import import_optional
 from vkc_pin.world.files.writing import write_folder_atomically
-from vkc_pin.world.trajectory.formats.ros import to_ros
+from vkc_pin.world.trajectory.formats.ros import sample_states, to_ros
 
 __all__ = ["TOPICS", "import_rosbags", "write_rosbag"]
 
@@ -149,19 +150,18 @@ def _make_messages(
         begin,
         types["nav_msgs/msg/Path"](header(_make_time(types, begin), frame), poses),
     )
-    for point in to_ros(motion, joints="base", rate=states, derivatives=1)["points"]:
-        when = begin + _count_nanoseconds(point["time_from_start"])
-        yield (
-            "base/cmd_vel",
-            when,
-            _make_twist(types, point, header(_make_time(types, when), base_frame)),
-        )
-    objects = to_ros(motion, joints="objects", rate=states, derivatives=1)
-    for point in objects["points"] if objects["joint_names"] else ():
-        when = begin + _count_nanoseconds(point["time_from_start"])
-        values = (np.array(point[key], float) for key in ("positions", "velocities", "effort"))
+    _, times, positions, velocities = sample_states(motion, "base", states)
+    for time, pose, velocity in zip(times, positions, velocities, strict=True):
+        when = begin + round(time * _NANO)
+        twist = _make_twist(types, pose[2], velocity, header(_make_time(types, when), base_frame))
+        yield "base/cmd_vel", when, twist
+    names, times, positions, velocities = sample_states(motion, "objects", states)
+    for time, position, velocity in zip(times, positions, velocities, strict=True):
+        if not names:
+            break
+        when = begin + round(time * _NANO)
         state = types["sensor_msgs/msg/JointState"](
-            header(_make_time(types, when), frame), objects["joint_names"], *values
+            header(_make_time(types, when), frame), names, position, velocity, np.empty(0)
         )
         yield "objects/joint_states", when, state
     for phase in motion["phases"]:
@@ -189,10 +189,10 @@ def _make_pose(types: Any, point: Mapping[str, Any]) -> Any:
     return types["geometry_msgs/msg/Pose"](types["geometry_msgs/msg/Point"](x, y, 0.0), turn)
 
 
-def _make_twist(types: Any, point: Mapping[str, Any], header: Any) -> Any:
+def _make_twist(types: Any, yaw: float, velocity: Floats, header: Any) -> Any:
     """Return a velocity of the base in its own frame."""
-    vx, vy, turn = point["velocities"]
-    c, s = math.cos(point["positions"][2]), math.sin(point["positions"][2])
+    vx, vy, turn = velocity.tolist()
+    c, s = math.cos(yaw), math.sin(yaw)
     vector = types["geometry_msgs/msg/Vector3"]
     linear, angular = vector(c * vx + s * vy, c * vy - s * vx, 0.0), vector(0.0, 0.0, turn)
     twist = types["geometry_msgs/msg/Twist"](linear, angular)

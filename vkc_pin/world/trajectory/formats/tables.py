@@ -265,12 +265,20 @@ def infer_robot_size(names: Sequence[str], **where: Any) -> int:
         where: File, and line or field, for the error.
 
     Raises:
-        InputError: The first ones are not those of the base, as in a motion of an arm alone.
+        InputError: The first ones are not those of the base, as in a motion of an arm alone, or
+            joints of objects come before others, as in alphabetical order.
     """
     if tuple(names[:3]) != _BASE:
         expected = f"{', '.join(_BASE)} first, or the argument robot_size"
         raise InputError("no base coordinates", expected=expected, got=tuple(names[:3]), **where)
-    return next((k for k, name in enumerate(names) if "." in str(name)), len(names))
+    has_dot = ["." in str(name) for name in names]
+    size = has_dot.index(True) if True in has_dot else len(names)
+    if not all(has_dot[size:]):
+        first, late = names[size], names[size + has_dot[size:].index(False)]
+        expected = f"joints of the robot before those of objects such as {format_value(first)}, "
+        expected += "or the argument robot_size"
+        raise InputError("not in order", expected=expected, got=format_value(late), **where)
+    return size
 
 
 def make_single_phase(waypoints: int) -> dict[str, Any]:

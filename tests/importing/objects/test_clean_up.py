@@ -100,7 +100,7 @@ def test_long_chains_of_fixed_links_are_merged() -> None:
     assert hinge.parent == "l0"
     assert hinge.placement.translation == pytest.approx([0.01 * (count - 1), 0.0, 0.0])
     assert len(merged.links["l0"].collision) == count - 1
-    assert [f"link 'l{k}'" in note for k, note in enumerate(merged.notes, count)] == [True] * 2
+    assert ["moves no shape" in note for note in merged.notes] == [True] * 2
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,12 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.importing.objects.clean_up import (
+    MOVING,
+    collect_attached_links,
     compute_bounds,
     extract_subtree,
     find_closed_positions,
+    fix_immovable_joints,
     load_surfaces,
     move_root,
     rename,
@@ -29,7 +32,6 @@ _FLOOR_BEYOND = 2.0  # [m] of floor on sides without walls: a robot's length, an
 _WALL_HEIGHT = 0.5  # [m] at which walls are found, below windows
 _WALL_DEPTH = 0.5  # [m] from the side of the home within which walls belong to the side
 _BUILDING = 3.5  # [m] length above which a link is part of the building, not furniture
-_MOVING = ("revolute", "continuous", "prismatic")
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +80,7 @@ def split_home(description: Description) -> Home:
     building, each joint starts an object of its own, without fixed shapes: doors may swing past
     walls.
     """
-    description = _fix_immovable_joints(description)
+    description = fix_immovable_joints(description)
     joints, notes = description.joints, list(description.notes)
     places, values = description.compute_placements(), find_closed_positions(description)
     current_placements = description.compute_placements(values)
@@ -100,11 +102,11 @@ def split_home(description: Description) -> Home:
         children = [
             child
             for child, joint in joints.items()
-            if joint.parent == name and joint.kind in _MOVING
+            if joint.parent == name and joint.kind in MOVING
         ]
         large = name == description.root or _measure_length(link) > _BUILDING
         if children and not large:
-            attached = (_collect_attached_links(description, child) for child in children)
+            attached = (collect_attached_links(description, child) for child in children)
             part = _extract_links(description, name, {name}.union(*attached))
             objects.append(_place_object(name, part, places[name]))
             continue
@@ -118,15 +120,15 @@ def split_home(description: Description) -> Home:
             visual = link.visual if not low else ()
             (building if large else furniture).append(Link(name, visual, solid))
     for name in free:
-        links_of_object = _collect_attached_links(description, name)
+        links_of_object = collect_attached_links(description, name)
         if not any(description.links[link].solid for link in links_of_object):
             notes.append(f"link '{name}' is free and has no shape: left out")
             continue
         part = _extract_links(description, name, links_of_object)
         fixed_joints = dict(part.joints)
         for child, joint in part.joints.items():
-            if joint.kind in _MOVING:
-                fixed_joints[child] = _fix_joint(joint, values.get(joint.name, 0.0))
+            if joint.kind in MOVING:
+                fixed_joints[child] = joint.fix(values.get(joint.name, 0.0))
                 notes.append(f"joint '{joint.name}' belongs to the free object '{name}': fixed")
         rigid = dataclasses.replace(part, joints=fixed_joints)
         objects.append(_place_object(name, rigid, current_placements[name], free=True))
@@ -168,38 +170,6 @@ def add_floor(home: Home, low: Floats, high: Floats) -> tuple[Floats, Floats]:
     return low - beyond[0], high + beyond[1]
 
 
-def _fix_immovable_joints(description: Description) -> Description:
-    """Return the home with those joints fixed that have one value or move no shape."""
-    joints, notes = dict(description.joints), list(description.notes)
-    for child, joint in description.joints.items():
-        if joint.kind not in _MOVING:
-            continue
-        is_single_valued = joint.limits is not None and joint.limits[0] == joint.limits[1]
-        if is_single_valued or not any(
-            description.links[link].solid for link in _collect_attached_links(description, child)
-        ):
-            reason = "has a single value" if is_single_valued else "moves no shape"
-            notes.append(f"joint '{joint.name}' {reason}: fixed")
-            value = joint.limits[0] if is_single_valued and joint.limits else 0.0
-            joints[child] = _fix_joint(joint, value)
-    return dataclasses.replace(description, joints=joints, notes=tuple(notes))
-
-
-def _fix_joint(joint: Joint, value: float) -> Joint:
-    """Return a joint fixed at a position."""
-    placement = joint.placement * joint.compute_motion(value)
-    return dataclasses.replace(joint, kind="fixed", placement=placement, limits=None)
-
-
-def _collect_attached_links(description: Description, link: str) -> set[str]:
-    """Return a link and those attached to it, without free objects."""
-    found = description.subtree(link)
-    for child, joint in description.joints.items():
-        if child != link and child in found and joint.kind == "floating":
-            found -= description.subtree(child)
-    return found
-
-
 def _extract_links(
     description: Description, root: str, links_of_object: Collection[str]
 ) -> Description:
@@ -215,7 +185,7 @@ def _extract_links(
 
 def _add_empty_base(description: Description, child: str) -> Description:
     """Return the subtree of a joint, including the joint, on a base link without shapes."""
-    part = _extract_links(description, child, _collect_attached_links(description, child))
+    part = _extract_links(description, child, collect_attached_links(description, child))
     base = f"{child}_base"
     while base in description.links:
         base += "_"

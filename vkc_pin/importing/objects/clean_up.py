@@ -18,13 +18,16 @@ if TYPE_CHECKING:
     import trimesh
 
 __all__ = [
+    "MOVING",
     "Surfaces",
     "add_missing_limits",
     "choose_name",
+    "collect_attached_links",
     "compute_bounds",
     "extract_subtree",
     "find_closed_positions",
     "find_multiple_objects",
+    "fix_immovable_joints",
     "load_surfaces",
     "make_upright",
     "merge_fixed_links",
@@ -34,6 +37,8 @@ __all__ = [
     "scale_object",
 ]
 
+MOVING = ("revolute", "continuous", "prismatic")
+"""Kinds of joints that have a position."""
 Surfaces = Mapping[int, "trimesh.Trimesh"]
 """Surfaces of parts in the frame of their link, by `id` of the part."""
 _OPEN = np.pi / 2.0  # [rad] opening angle of hinges without limits
@@ -131,60 +136,77 @@ def rename(
     return dataclasses.replace(description, links=links, joints=joints)
 
 
-def merge_fixed_links(description: Description) -> Description:
-    """Return the object with fixed links merged into their parents.
+def fix_immovable_joints(description: Description) -> Description:
+    """Return the object with those joints fixed that have one value or move no shape, each noted.
 
-    Joints that move no shape are left out with their links, and noted. Joints with a single value
-    become fixed.
+    They are fixed in their closed position. Floating joints stay, and end what a joint moves.
     """
-    links, joints = dict(description.links), dict(description.joints)
+    joints = dict(description.joints)
     notes = list(description.notes)
-    has_shape = set[str]()  # links that are, or move, a shape
-    for name, link in links.items():
-        while link.solid and name not in has_shape:
-            has_shape.add(name)
-            name = joints[name].parent if name in joints else name
-    for child in [child for child in joints if child not in has_shape]:
-        notes.append(f"joint '{joints[child].name}' moves no shape: left out with link '{child}'")
-        links.pop(child, None)
-        del joints[child]
-    for child, joint in joints.items():
-        if (
-            joint.kind != "fixed"
-            and joint.limits is not None
-            and joint.limits[0] == joint.limits[1] != 0.0
-        ):
-            placement = joint.placement * joint.compute_motion(joint.limits[0])
-            joints[child] = dataclasses.replace(joint, placement=placement, limits=(0.0, 0.0))
-    children = dataclasses.replace(description, joints=joints).children()
+    closed_positions = find_closed_positions(description)
+    for child, joint in description.joints.items():
+        if joint.kind not in MOVING:
+            continue
+        moved_links = [
+            description.links[name] for name in collect_attached_links(description, child)
+        ]
+        if joint.limits is not None and joint.limits[0] == joint.limits[1]:
+            notes.append(f"joint '{joint.name}' has a single value: fixed")
+        elif not any(link.solid for link in moved_links):
+            mass = sum(link.inertia.mass for link in moved_links)
+            weight = f"; its {mass:.3g} kg move with link '{joint.parent}'" if mass > 0.0 else ""
+            notes.append(f"joint '{joint.name}' moves no shape: fixed{weight}")
+        else:
+            continue
+        joints[child] = joint.fix(closed_positions.get(joint.name, 0.0))
+    return dataclasses.replace(description, joints=joints, notes=tuple(notes))
+
+
+def collect_attached_links(description: Description, link: str) -> set[str]:
+    """Return a link and those attached to it, without free objects."""
+    found = description.subtree(link)
+    for child, joint in description.joints.items():
+        if child != link and child in found and joint.kind == "floating":
+            found -= description.subtree(child)
+    return found
+
+
+def merge_fixed_links(description: Description) -> Description:
+    """Return the object with fixed links merged into their parents, masses and inertias included.
+
+    Joints with a single value, or that move no shape, become fixed before, and are noted.
+    """
+    description = fix_immovable_joints(description)
+    links = dict(description.links)
+    joints = dict(description.joints)
+    children = description.children()
     for child in list(joints):
         joint = joints[child]
-        is_single_valued = joint.kind != "fixed" and joint.limits == (0.0, 0.0)
-        if is_single_valued:
-            notes.append(f"joint '{joint.name}' has a single value: fixed")
-        if joint.kind == "fixed" or is_single_valued:
-            parent, removed = links[joint.parent], links.pop(child)
-            visual, collision = (
-                _transform_parts(removed, parts, joint.placement)
-                for parts in (removed.visual, removed.collision)
+        if joint.kind != "fixed":
+            continue
+        parent = links[joint.parent]
+        removed = links.pop(child)
+        visual = _transform_parts(removed, removed.visual, joint.placement)
+        collision = _transform_parts(removed, removed.collision, joint.placement)
+        # If only one of them has collision shapes, the other collides with its visual ones.
+        if bool(parent.collision) != bool(removed.collision):
+            parent = dataclasses.replace(parent, collision=parent.solid)
+            collision = collision or visual
+        links[joint.parent] = Link(
+            parent.name,
+            (*parent.visual, *visual),
+            (*parent.collision, *collision),
+            parent.inertia + joint.placement.act(removed.inertia),
+        )
+        del joints[child]
+        moved = [name for name in children.pop(child, ()) if name in joints]
+        children[joint.parent] += moved
+        for name in moved:
+            placement = joint.placement * joints[name].placement
+            joints[name] = dataclasses.replace(
+                joints[name], parent=joint.parent, placement=placement
             )
-            # If only one of them has collision shapes, the other collides with its visual ones.
-            if bool(parent.collision) != bool(removed.collision):
-                parent = dataclasses.replace(parent, collision=parent.solid)
-                collision = collision or visual
-            inertia = parent.inertia + joint.placement.act(removed.inertia)
-            links[joint.parent] = Link(
-                parent.name, (*parent.visual, *visual), (*parent.collision, *collision), inertia
-            )
-            del joints[child]
-            moved = [name for name in children.pop(child, ()) if name in joints]
-            children[joint.parent] += moved
-            for name in moved:
-                placement = joint.placement * joints[name].placement
-                joints[name] = dataclasses.replace(
-                    joints[name], parent=joint.parent, placement=placement
-                )
-    return dataclasses.replace(description, links=links, joints=joints, notes=tuple(notes))
+    return dataclasses.replace(description, links=links, joints=joints)
 
 
 def _transform_parts(link: Link, parts: tuple[Part, ...], placement: pin.SE3) -> tuple[Part, ...]:
@@ -212,10 +234,12 @@ def compute_bounds(
     placements = description.compute_placements(values)
     points = _place_vertices(description, meshes, placements, description.links)
     if not points:
+        notes = "; ".join(description.notes[:3])  # they say what was left out
         raise InputError(
-            "the file has no shapes",
+            "no shapes are left" if notes else "the file has no shapes",
             file=description.file,
-            expected="<collision> or <visual> elements",
+            expected="<collision> or <visual> elements (URDF, SDF), or geoms (MJCF)",
+            got=notes or None,
         )
     vertices = np.vstack(points)
     return vertices.min(axis=0), vertices.max(axis=0)

@@ -140,6 +140,11 @@ class Joint:
             return pin.SE3(np.eye(3), self.axis * value)
         return pin.SE3(pin.exp3(self.axis * value), np.zeros(3))
 
+    def fix(self, value: float) -> Joint:
+        """Return the joint fixed at a position, [rad] or [m]."""
+        placement = self.placement * self.compute_motion(value)
+        return replace(self, kind="fixed", placement=placement, limits=None)
+
 
 @dataclass(frozen=True, eq=False)
 class Description:

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from vkc_pin.errors import InputError
+from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.utils.isolation import run_isolated
 from vkc_pin.utils.optional_imports import import_optional
 from vkc_pin.utils.system import is_file
@@ -23,6 +23,13 @@ from vkc_pin.world.files.resources import find_package
 __all__ = ["expand_xacro", "uses_xacro"]
 
 _FIND = re.compile(r"\$\(find\s+([^\s()$]+)\s*\)")  # NAME in $(find NAME)
+_COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
+# NAME in <xacro:arg name="NAME" ...>, $(arg NAME) and xacro.arg('NAME')
+_ARGUMENTS = (
+    re.compile(r"<xacro:arg\s[^>]*?\bname\s*=\s*[\"']([^\"']+)[\"']"),
+    re.compile(r"\$\(arg\s+([^\s()$]+)\s*\)"),
+    re.compile(r"\bxacro\.arg\(\s*[\"']([^\"']+)[\"']"),
+)
 
 
 def uses_xacro(root: ElementTree.Element, file: Path) -> bool:
@@ -42,6 +49,7 @@ def expand_xacro(file: Path, packages: Mapping[str, Path], arguments: Mapping[st
 
     Raises:
         InputError: xacro is not installed or cannot read the file, or a package is not found.
+        UnknownNameError: Neither the file nor those that it includes know an argument.
     """
     import_optional("xacro", "import", purpose="a xacro file", file=file)
     return run_isolated(
@@ -68,7 +76,7 @@ def _expand_xacro(
             contextlib.redirect_stderr(messages),
         ):
             document = xacro.process_file(str(path), mappings=dict(arguments))
-            return str(document.toprettyxml(indent="  "))
+            expanded = str(document.toprettyxml(indent="  "))
     except MemoryError:
         raise
     except (Exception, SystemExit) as error:  # macros, expressions and XML raise any type
@@ -77,11 +85,15 @@ def _expand_xacro(
             cause = cause.exc
         if isinstance(cause, MemoryError):  # of an expression
             raise MemoryError from error
-        includes = [path, *map(Path, xacro.all_includes[known:])]
-        _check_packages(includes, path, file, packages)
+        files = [path, *map(Path, xacro.all_includes[known:])]
+        _check_packages(files, path, file, packages)
+        if isinstance(cause, (substitution_args.ArgException, KeyError)):  # one that is not given
+            _check_arguments(files, file, arguments)
         problem = " ".join((str(error) or messages.getvalue()).split())
         problem = problem.partition(" [Errno")[0]  # repeats the sentence before
         raise InputError(f"xacro cannot process the file: {problem}", file=file) from error
+    _check_arguments([path, *map(Path, xacro.all_includes[known:])], file, arguments)
+    return expanded
 
 
 @contextlib.contextmanager
@@ -105,16 +117,32 @@ def _search_packages(
         module._eval_find = original
 
 
+def _check_arguments(files: Iterable[Path], file: Path, arguments: Iterable[str]) -> None:
+    """Raise an error about the first argument that some files neither declare nor use.
+
+    xacro itself ignores such arguments. Names that an expression computes may be any.
+    """
+    texts = [_COMMENT.sub("", _read_quietly(each)) for each in files]
+    names = {name for text in texts for pattern in _ARGUMENTS for name in pattern.findall(text)}
+    if any("$" in name for name in names):
+        return
+    for argument in arguments:
+        if argument not in names:
+            raise UnknownNameError(
+                "xacro argument", argument, sorted(names), file=file, field="arguments"
+            )
+
+
+def _read_quietly(file: Path) -> str:
+    """Return the text of a file; empty if there is none."""
+    return file.read_text(encoding="utf-8", errors="replace") if is_file(file) else ""
+
+
 def _check_packages(
     files: Iterable[Path], path: Path, file: Path, packages: Mapping[str, Path]
 ) -> None:
     """Raise an error that lists all packages in `$(find NAME)` of some files that are missing."""
-    names = dict.fromkeys(
-        name
-        for each in files
-        if is_file(each)
-        for name in _FIND.findall(each.read_text(encoding="utf-8", errors="replace"))
-    )
+    names = dict.fromkeys(name for each in files for name in _FIND.findall(_read_quietly(each)))
     if missing := [name for name in names if find_package(name, path, packages) is None]:
         raise InputError(
             f"packages were not found: {', '.join(missing)}",

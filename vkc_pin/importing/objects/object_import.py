@@ -13,6 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
+from vkc_pin.importing.formats import check_no_arguments, read_root
 from vkc_pin.importing.objects.clean_up import (
     add_missing_limits,
     compute_bounds,
@@ -49,10 +50,8 @@ from vkc_pin.utils.arguments import (
     check_text,
 )
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.files.documents import read_text
 from vkc_pin.world.files.resources import check_path, choose_file_names
 from vkc_pin.world.files.writing import write_folder_atomically
-from vkc_pin.world.files.xml import parse_xml
 from vkc_pin.world.models.articulated_object import ArticulatedObject
 from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.models.robot import Robot
@@ -142,10 +141,13 @@ def read_description(
 def _read_format(
     path: Path, packages: Mapping[str, Path], arguments: Mapping[str, str], *, free: bool
 ) -> Description:
-    root = parse_xml(read_text(path, "URDF, xacro, MJCF or SDF"), path)
-    if root.tag == "robot":
-        text = expand_xacro(path, packages, arguments) if uses_xacro(root, path) else None
+    _, root = read_root(path, "URDF, xacro, MJCF or SDF")
+    if root.tag == "robot" and uses_xacro(root, path):
+        text = expand_xacro(path, packages, arguments)
         return read_object_urdf(path, free=free, packages=packages, text=text)
+    check_no_arguments(path, arguments)
+    if root.tag == "robot":
+        return read_object_urdf(path, free=free, packages=packages)
     if root.tag == "mujoco":
         return read_object_mjcf(path, free=free)
     if root.tag == "sdf":
@@ -175,8 +177,8 @@ def import_object(  # noqa: PLR0913 - keyword options of a public call
 ) -> ImportedObject:
     """Import an object from a URDF, xacro, MJCF or SDF file.
 
-    Its shapes become convex pieces and fixed links are merged. Links without shapes are dropped,
-    and missing limits chosen. The origin is below the centre, at the height of the lowest point.
+    Its shapes become convex pieces, fixed links are merged with their masses, and missing limits
+    chosen. The origin is below the centre, at the height of the lowest point.
     Attachments are proposed for every joint.
 
     Args:

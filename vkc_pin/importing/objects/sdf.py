@@ -82,6 +82,7 @@ class _Reader:
                 got=got,
             )
         self.is_world = bool(worlds)
+        self.root = worlds[0] if worlds else models[0]
         self.world = self._make_scope(
             Scope(file, worlds[0] if worlds else root, rules), (file.resolve(),)
         )
@@ -212,6 +213,16 @@ class _Reader:
                     problem = "two links have the same name"
                     raise make_element_error(scope.file, link, problem, field=key)
                 links[key] = scope, name
+        if not links:
+            got = ", ".join(f"<{tag}>" for tag in dict.fromkeys(item.tag for item in self.root))
+            raise make_element_error(
+                self.file,
+                self.root,
+                "a world without links",
+                field=self.root.get("name"),
+                expected="<model>s with <link>s",
+                got=got or "nothing",
+            )
         joints: dict[str, tuple[Scope, ElementTree.Element, str]] = {}  # by the child link
         for scope in scopes:
             for name, joint in scope.joints.items():

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from vkc_pin.errors import InputError
+from vkc_pin.importing.formats import check_no_arguments, read_root
 from vkc_pin.importing.missing_meshes import replace_missing_meshes
 from vkc_pin.importing.parsers import expand_xacro, uses_xacro
 from vkc_pin.importing.robots.mjcf import convert_mjcf
-from vkc_pin.world.files.documents import read_text
 from vkc_pin.world.files.kinematic_tree import check_tree
 from vkc_pin.world.files.srdf import Srdf, read_groups, read_srdf
 from vkc_pin.world.files.urdf import UrdfFile
@@ -55,8 +55,9 @@ def read_source(
     srdf: Path | None = None,
 ) -> Source:
     """Read a URDF, xacro or MJCF file, whose first element tells its format."""
-    text = read_text(file, "robot")
-    root = parse_xml(text, file)
+    text, root = read_root(file, "URDF, xacro or MJCF")
+    if root.tag != "robot" or not uses_xacro(root, file):
+        check_no_arguments(file, arguments)
     notes: list[str] = []
     states: dict[str, dict[str, float]] = {}
     linkages: Sequence[Sequence[Mapping[str, float]]] = ()

@@ -22,6 +22,7 @@ __all__ = [
     "parse_document",
     "parse_json",
     "read_bytes",
+    "read_head",
     "read_text",
     "read_yaml",
 ]
@@ -128,10 +129,25 @@ class Document:
             ) from error
 
 
+def read_head(file: str | Path, kind: str, count: int) -> bytes:
+    """Return the first bytes of a file, at most `count`; see `read_bytes`."""
+    return _read_start(file, kind, count)[0]
+
+
 def read_bytes(file: str | Path, kind: str, largest: int | None = None) -> bytes:
     """Return a file of a `kind` ("YAML", "plan"), up to `largest` or `MAX_FILE_SIZE` bytes."""
-    path, expected = Path(file), f"an existing {kind} file"
     largest = MAX_FILE_SIZE if largest is None else largest
+    data, size = _read_start(file, kind, largest + 1)
+    if size > largest:
+        raise InputError(
+            f"the {kind} is too large", file=file, expected=f"at most {largest:g} bytes", got=size
+        )
+    return data
+
+
+def _read_start(file: str | Path, kind: str, count: int) -> tuple[bytes, int]:
+    """Return the first bytes of a file, at most `count`, and its size [bytes]."""
+    path, expected = Path(file), f"an existing {kind} file"
     try:
         if (
             not path.is_file() and not path.is_dir() and path.exists()
@@ -140,8 +156,8 @@ def read_bytes(file: str | Path, kind: str, largest: int | None = None) -> bytes
                 f"cannot read the {kind}", file=file, expected=expected, got="a pipe or a device"
             )
         with path.open("rb") as stream:
-            data = stream.read(largest + 1)
-            size = max(len(data), os.fstat(stream.fileno()).st_size)
+            data = stream.read(count)
+            return data, max(len(data), os.fstat(stream.fileno()).st_size)
     except InputError:
         raise
     except (OSError, ValueError) as error:  # the latter: a NUL in the name
@@ -149,11 +165,6 @@ def read_bytes(file: str | Path, kind: str, largest: int | None = None) -> bytes
         raise InputError(
             f"cannot read the {kind}", file=file, expected=expected, got=got
         ) from error
-    if size > largest:
-        raise InputError(
-            f"the {kind} is too large", file=file, expected=f"at most {largest:g} bytes", got=size
-        )
-    return data
 
 
 def read_text(file: str | Path, kind: str, largest: int | None = None) -> str:

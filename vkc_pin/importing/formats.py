@@ -1,0 +1,84 @@
+"""Recognises the files that importers read, and names those that they do not."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from pathlib import Path
+
+from vkc_pin.errors import InputError
+from vkc_pin.world.files.documents import read_head, read_text
+from vkc_pin.world.files.xml import parse_xml
+
+__all__ = ["check_no_arguments", "read_root"]
+
+_HEAD = 4096  # bytes in which the first element of an XML file begins
+_SIGNATURES = {
+    b"#usda": "USD",
+    b"PXR-USDC": "USD",
+    b"glTF": "glTF",
+    b"ply": "PLY",
+    b"# .PCD": "PCD",
+    b"# Octomap": "OctoMap",
+    b"solid ": "STL",
+    b"Kaydara FBX": "FBX",
+    b"ISO-10303-21": "STEP",
+    b"BLENDER": "Blender",
+    b"#VRML": "VRML or Webots",
+}
+"""First bytes of a file → its format."""
+_SUFFIXES = {
+    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), "USD"),
+    **dict.fromkeys((".glb", ".gltf"), "glTF"),
+    **dict.fromkeys((".bt", ".ot"), "OctoMap"),
+    **dict.fromkeys((".step", ".stp"), "STEP"),
+    **dict.fromkeys((".wbt", ".proto"), "Webots"),
+    **dict.fromkeys((".yaml", ".yml"), "YAML (such as a map of nav2)"),
+    ".blend": "Blender",
+    ".fbx": "FBX",
+    ".json": "JSON",
+    ".mjb": "MuJoCo's binary format",
+    ".obj": "OBJ",
+    ".pcd": "PCD",
+    ".pgm": "an image of a map",
+    ".ply": "PLY",
+    ".scene": "MoveIt .scene",
+    ".stl": "STL",
+    ".ttt": "CoppeliaSim",
+    ".ttm": "CoppeliaSim",
+}
+"""Suffix of a file that is no XML → its format."""
+
+
+def read_root(file: Path, formats: str) -> tuple[str, ElementTree.Element]:
+    """Return text and root element of an XML file.
+
+    Args:
+        file: The file.
+        formats: The formats that are read, "URDF or MJCF".
+
+    Raises:
+        InputError: The file cannot be read, is not XML, or has another format, which is named.
+    """
+    head = read_head(file, formats, _HEAD).removeprefix(b"\xef\xbb\xbf").lstrip()
+    if head and not head.startswith(b"<"):
+        matches = (name for start, name in _SIGNATURES.items() if head.startswith(start))
+        name = next(matches, _SUFFIXES.get(file.suffix.lower()))
+        if name is not None:
+            problem = f"{name} is not supported"
+            expected = f"{formats}: export or convert it to one of these"
+            raise InputError(problem, file=file, expected=expected)
+    text = read_text(file, formats)
+    if text.strip() and not text.lstrip().startswith("<"):
+        expected = f"a {formats} file, which begins with an element"
+        first = text.split(maxsplit=1)[0]
+        raise InputError("the file is not XML", file=file, expected=expected, got=first[:40])
+    return text, parse_xml(text, file)
+
+
+def check_no_arguments(file: Path, arguments: Mapping[str, str]) -> None:
+    """Check that no arguments are given for a file that is not xacro."""
+    if arguments:
+        problem = "only xacro files have arguments"
+        expected, got = "no arguments, or a xacro file", ", ".join(arguments)
+        raise InputError(problem, file=file, field="arguments", expected=expected, got=got)

@@ -262,13 +262,14 @@ def make_coupled_robot(
     inside: str,
     *,
     limits: tuple[float, float] = (-1.0, 1.0),
+    leader_limits: tuple[float, float] = (-1.0, 1.0),
     kinds: tuple[str, str] = ("revolute", "revolute"),
     yaml: str = "",
 ) -> vkc.Robot:
     """Return a robot with two joints, of which the second follows the first."""
     parts = [
         *(format_link(f"l{k}", "0.1 0.1 0.1", f"0 0 {k}") for k in range(3)),
-        format_joint("one", kinds[0], "l0", "l1", limits=(-1.0, 1.0), velocity=0.4),
+        format_joint("one", kinds[0], "l0", "l1", limits=leader_limits, velocity=0.4),
         format_joint("two", kinds[1], "l1", "l2", limits=limits, velocity=0.6, inside=inside),
     ]
     (tmp_path / "robot.urdf").write_text(f'<robot name="robot">{"".join(parts)}</robot>')
@@ -342,3 +343,54 @@ def test_incompatible_limits_raise(tmp_path: Path) -> None:
     message = "one: no position satisfies the limits of its follower 'two'.*2 to 3.*-1 to 1"
     with expect_error(message):
         make_coupled_robot(tmp_path, format_mimic("one"), limits=(2.0, 3.0))
+
+
+@pytest.mark.parametrize(
+    ("multiplier", "offset", "limits", "value"),
+    [
+        (-1.0, 0.0, (0.0, 0.055), 0.0),
+        (-2.0, 0.0, (0.0, 1.0), 0.0),
+        (-1.0, 0.0, (-0.7, 0.0), 0.0),
+        (-0.5, 0.9, (0.2, 0.6), 0.6),
+        (1.0, 0.4, (0.1, 0.5), 0.1),
+    ],
+)
+def test_limits_copied_to_a_follower_may_leave_one_position(
+    tmp_path: Path, multiplier: float, offset: float, limits: tuple[float, float], value: float
+) -> None:
+    """The position is not negative zero, which random numbers cannot be drawn up to."""
+    mimic = format_mimic("one", multiplier, offset)
+    with pytest.warns(UserWarning, match=f"one: the limits of .* 'two' leave it at {value:g}"):
+        robot = make_coupled_robot(tmp_path, mimic, limits=limits, leader_limits=limits)
+    assert (robot.lower[3], robot.upper[3]) == pytest.approx((value, value))
+    assert robot.lower[3] == robot.upper[3]
+    assert not np.signbit([robot.lower[3], robot.upper[3]]).any()
+
+
+def test_a_finger_with_the_limits_of_its_leader_is_imported(tmp_path: Path) -> None:
+    """The name of the fingers may make them the end of an arm."""
+    box, parts = "0.05 0.05 0.1", [format_link("l0", "0.2 0.2 0.1", "0 0 0.05")]
+    for k in range(1, 7):
+        axis = ("0 0 1", "0 1 0", "1 0 0")[k % 3]
+        parts += [
+            format_link(f"l{k}", box),
+            format_joint(f"j{k}", "revolute", f"l{k - 1}", f"l{k}", "0 0 0.15", axis),
+        ]
+    for name, side in (("arm_finger_a", 0.01), ("arm_finger_b", -0.01)):
+        mimic = format_mimic("arm_finger_a_joint", -1.0) if side < 0.0 else ""
+        parts += [
+            format_link(name, "0.02 0.01 0.08", f"0 {side} 0.09"),
+            format_joint(
+                f"{name}_joint",
+                "prismatic",
+                "l6",
+                name,
+                "0 0 0",
+                "0 1 0",
+                (0.0, 0.05),
+                inside=mimic,
+            ),
+        ]
+    (tmp_path / "r.urdf").write_text(f'<robot name="r">{"".join(parts)}</robot>')
+    made = vkc.importing.import_robot(tmp_path / "r.urdf", tmp_path / "out")
+    assert set(made.robot.coordinates.names) >= {f"j{k}" for k in range(1, 7)}

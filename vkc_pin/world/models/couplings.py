@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Mapping, Sequence, Set
 from dataclasses import dataclass
@@ -297,19 +298,27 @@ def tighten_coupled_limits(full: pin.Model, file: UrdfFile, tool_frame: str) -> 
         for joint, coupling in group.items():
             i = model.joints[model.getJointId(joint)].idx_q
             low, high = sorted(
-                (bound - coupling.offset) / coupling.factor for bound in (lower[i], upper[i])
+                (bound - coupling.offset) / coupling.factor + 0.0 for bound in (lower[i], upper[i])
             )
-            if max(low, lower[index]) > min(high, upper[index]) + LIMIT_SLACK:
+            common_low = max(low, lower[index])
+            common_high = min(high, upper[index])
+            if common_low > common_high + LIMIT_SLACK:
                 problem, expected = (
                     f"no position satisfies the limits of its follower '{joint}'",
                     f"limits that overlap {low:g} to {high:g}",
                 )
                 got = f"{lower[index]:g} to {upper[index]:g}"
                 raise InputError(problem, file=file.path, field=leader, expected=expected, got=got)
-            lower[index], upper[index] = (
-                max(low, lower[index]),
-                max(min(high, upper[index]), max(low, lower[index])),
-            )
+            if common_low >= common_high and lower[index] < upper[index]:
+                warnings.warn(
+                    f"{file.path}: {leader}: the limits of its follower '{joint}' leave it at "
+                    f"{common_low:g}: they allow {low:g} to {high:g}, its own "
+                    f"{lower[index]:g} to {upper[index]:g}",
+                    stacklevel=2,
+                )
+            # A sum with +0.0 has no negative zero, which would lie below a lower limit of 0.
+            lower[index] = common_low + 0.0
+            upper[index] = max(common_low, common_high) + 0.0
     model.lowerPositionLimit, model.upperPositionLimit = lower, upper
     return model
 

@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from vkc_pin.planning.chain.chain import get_kinematics
 from vkc_pin.planning.kinematics.batch import estimate_size
-from vkc_pin.planning.nlp.sparse import assemble
+from vkc_pin.planning.nlp.sparse import assemble, get_pattern
 from vkc_pin.utils.arrays import Ints
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.models.coordinates import Coordinates
@@ -150,8 +150,8 @@ class TermFunctions:
         self.value = ca.Function("term", [z, dt], [value], options)
         self.jacobian = ca.Function("term_jacobian", [z, dt], [slopes], options)
         self.hessian = ca.Function("term_hessian", [z, dt, multipliers], [curvatures], options)
-        self.jacobian_pattern = [np.array(part, int) for part in jacobian.sparsity().get_triplet()]
-        self.hessian_pattern = [np.array(part, int) for part in hessian.sparsity().get_triplet()]
+        self.jacobian_pattern = get_pattern(jacobian)
+        self.hessian_pattern = get_pattern(hessian)
         self.nbytes = estimate_size(self.value, self.jacobian, self.hessian)
 
 

@@ -180,9 +180,9 @@ class Transcription:
             hessians.append(ca.vec(kind.hessian.map(len(at))(*inputs, multipliers)))
             value_rows.append(rows.ravel())
             first, offset = first_row[at][:, None], np.array(at)[:, None] * self.width
-            row, column = map(np.array, kind.jacobian_pattern)
+            row, column = kind.jacobian_pattern
             jacobian_at.append(np.stack([(first + row).ravel(), (offset + column).ravel()]))
-            row, column = map(np.array, kind.hessian_pattern)
+            row, column = kind.hessian_pattern
             hessian_at.append(np.stack([(offset + row).ravel(), (offset + column).ravel()]))
             for t in at:
                 begin = first_row[t] + K

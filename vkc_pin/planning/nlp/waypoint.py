@@ -17,7 +17,7 @@ from vkc_pin.planning.chain.chain import get_kinematics
 from vkc_pin.planning.chain.pose import POSE_OFFSET_SIZE, PoseRow, build_pose_rows, relax_target
 from vkc_pin.planning.kinematics.batch import estimate_size
 from vkc_pin.planning.kinematics.machine_code import MachineCode
-from vkc_pin.planning.nlp.sparse import assemble
+from vkc_pin.planning.nlp.sparse import assemble, get_pattern
 from vkc_pin.planning.nlp.term_rows import TermRow
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.utils.budget import record_evaluations
@@ -129,10 +129,10 @@ class WaypointFunctions:
         self.value = ca.Function("g", inputs, [rows])
         self.jacobian = ca.Function("rows_jacobian", inputs, [ca.vertcat(*jacobian.nonzeros())])
         record_evaluations()
-        self.jacobian_pattern = jacobian.sparsity().get_triplet()
+        self.jacobian_pattern = get_pattern(jacobian)
         nonzeros = ca.vertcat(*hessian.nonzeros())
         self.hessian = ca.Function("lagrangian_hessian", [*inputs, multipliers], [nonzeros])
-        self.hessian_pattern = hessian.sparsity().get_triplet()
+        self.hessian_pattern = get_pattern(hessian)
         self.code = MachineCode(self.value, self.jacobian, self.hessian)
         self.nbytes = estimate_size(self.value, self.jacobian, self.hessian)
 
@@ -160,39 +160,39 @@ class StepRows:
     """
 
     def __init__(self, rolling: RollingLimits, path: ca.MX, gears: ca.MX, *, width: int) -> None:
-        self.rolling, self.segments = rolling, path.shape[1] - 1
+        self.rolling = rolling
+        self.segments = path.shape[1] - 1
         self.size = width * self.segments
-        value, jacobian, self._hessian = _make_step_functions(rolling)
-        self.rows, steps = value.size1_out(0), np.arange(self.segments)
+        self._functions = _StepFunctions(rolling)
+        self.rows = self._functions.value.size1_out(0)
         self._inputs = [ca.vertcat(path[:3, :-1], path[:3, 1:]), gears.T]
+        steps = np.arange(self.segments)
         columns = (steps[:, None, None] + [[-1], [0]]) * width + np.arange(3)
         # columns of both poses in x; negative for the start, which is no variable
         self._columns = columns.reshape(-1, 6)
         self.waypoints = np.repeat(steps, self.rows)
-        self.values = ca.vec(value.map(self.segments)(*self._inputs))
-        row, column = map(np.array, jacobian.sparsity_out(0).get_triplet())
-        slopes = jacobian.map(self.segments)(*self._inputs)
+        self.values = ca.vec(self._functions.value.map(self.segments)(*self._inputs))
+        row, column = self._functions.jacobian_pattern
+        slopes = self._functions.jacobian.map(self.segments)(*self._inputs)
         self.jacobian = self._place_nonzeros(
             slopes, steps[:, None] * self.rows + row, self._columns[:, column], len(self.waypoints)
         )
 
     def hessian(self, multipliers: ca.MX) -> ca.MX:
         """Return the upper triangle of the Hessian of multipliers·rows."""
-        row, column = map(np.array, self._hessian.sparsity_out(0).get_triplet())
+        row, column = self._functions.hessian_pattern
         multipliers = ca.reshape(multipliers, self.rows, self.segments)
-        curvatures = self._hessian.map(self.segments)(*self._inputs, multipliers)
+        curvatures = self._functions.hessian.map(self.segments)(*self._inputs, multipliers)
         return self._place_nonzeros(
             curvatures, self._columns[:, row], self._columns[:, column], self.size
         )
 
-    def _place_nonzeros(self, parts: ca.MX, row: Ints, column: Ints, height: int) -> ca.MX:
-        """Return the sparse matrix of all steps' nonzeros, without those of the start."""
+    def _place_nonzeros(self, nonzeros: ca.MX, row: Ints, column: Ints, height: int) -> ca.MX:
+        """Return the sparse matrix of all steps' nonzeros, one column a step, without the start."""
         positions = np.stack([row.ravel(), column.ravel()])
         is_variable = (positions >= 0).all(axis=0)
-        each = ca.horzsplit(parts, parts.shape[1] // self.segments)
-        nonzeros = ca.vertcat(*(part.nz[:] for part in each))
-        nonzeros = nonzeros[np.flatnonzero(is_variable).tolist()]
-        return assemble([nonzeros], [positions[:, is_variable]], height, self.size)
+        variable_nonzeros = ca.vec(nonzeros)[np.flatnonzero(is_variable).tolist()]
+        return assemble([variable_nonzeros], [positions[:, is_variable]], height, self.size)
 
     def bounds(self, dt: Floats | None) -> tuple[Floats, Floats]:
         """Return the bounds of the rows; `dt`, shape (N,) [s], limits wheel travel if given."""
@@ -204,25 +204,40 @@ class StepRows:
         return lower.ravel(), upper.ravel()
 
 
-def _make_step_functions(rolling: RollingLimits) -> tuple[ca.Function, ca.Function, ca.Function]:
-    """Return the SX functions of one step: rows, Jacobian, and upper triangle of the Hessian."""
-    poses, gear = ca.SX.sym("b", 6), ca.SX.sym("g")
-    dx, dy, turn = ca.vertsplit(poses[3:] - poses[:3])
-    heading = (poses[2] + poses[5]) / 2
-    longitudinal = ca.cos(heading) * dx + ca.sin(heading) * dy
-    rows = [ca.cos(heading) * dy - ca.sin(heading) * dx]
-    if rolling.turning_radius:
-        rows += [gear * longitudinal + side * rolling.turning_radius * turn for side in (-1, 1)]
-    if rolling.has_wheel_limit:
-        rows += [longitudinal + side * rolling.track / 2 * turn for side in (-1, 1)]
-    values, multipliers = ca.vertcat(*rows), ca.SX.sym("lam", len(rows))
-    hessian = ca.triu(ca.hessian(ca.dot(multipliers, values), poses)[0])
-    inputs, options = [poses, gear], {"cse": True}
-    return (
-        ca.Function("roll", inputs, [values], options),
-        ca.Function("roll_jacobian", inputs, [ca.jacobian(values, poses)], options),
-        ca.Function("roll_hessian", [*inputs, multipliers], [hessian], options),
-    )
+class _StepFunctions:
+    """SX functions of one step of a wheeled base, of both poses and the gear.
+
+    Attributes:
+        value, jacobian, hessian: Rows, nonzeros of their Jacobian, and nonzeros of the upper
+            triangle of the Hessian of multipliers·rows, each one column.
+        jacobian_pattern, hessian_pattern: Their rows and columns.
+    """
+
+    def __init__(self, rolling: RollingLimits) -> None:
+        poses = ca.SX.sym("b", 6)
+        gear = ca.SX.sym("g")
+        dx, dy, turn = ca.vertsplit(poses[3:] - poses[:3])
+        heading = (poses[2] + poses[5]) / 2
+        longitudinal = ca.cos(heading) * dx + ca.sin(heading) * dy
+        rows = [ca.cos(heading) * dy - ca.sin(heading) * dx]
+        if rolling.turning_radius:
+            rows += [gear * longitudinal + side * rolling.turning_radius * turn for side in (-1, 1)]
+        if rolling.has_wheel_limit:
+            rows += [longitudinal + side * rolling.track / 2 * turn for side in (-1, 1)]
+        values = ca.vertcat(*rows)
+        multipliers = ca.SX.sym("lam", len(rows))
+        jacobian = ca.jacobian(values, poses)
+        hessian = ca.triu(ca.hessian(ca.dot(multipliers, values), poses)[0])
+        # The nonzeros are returned as a column: those of a matrix with a single row would be
+        # mapped over the steps in another order.
+        slopes = ca.vertcat(*jacobian.nonzeros())
+        curvatures = ca.vertcat(*hessian.nonzeros())
+        inputs, options = [poses, gear], {"cse": True}
+        self.value = ca.Function("roll", inputs, [values], options)
+        self.jacobian = ca.Function("roll_jacobian", inputs, [slopes], options)
+        self.hessian = ca.Function("roll_hessian", [*inputs, multipliers], [curvatures], options)
+        self.jacobian_pattern = get_pattern(jacobian)
+        self.hessian_pattern = get_pattern(hessian)
 
 
 class _KinematicSweep:

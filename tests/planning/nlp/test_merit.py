@@ -13,6 +13,7 @@ import vkc_pin as vkc
 from vkc_pin.planning.nlp.merit import (
     GROWTH,
     MAX_WEIGHT,
+    TOLERANCE,
     Infeasibility,
     Merit,
     compute_shortfalls,
@@ -116,11 +117,16 @@ def test_penalty_is_the_weighted_sum_of_amounts() -> None:
 
 
 def test_weights_of_violated_kinds_increase() -> None:
+    """Each kind has the tolerance with which a solution is accepted; see `TOLERANCE`."""
     merit = Merit(2.0)
-    found = make_infeasibility(clearance=[0.0, 0.2], poses=[0.09, 0.0], terms=[0.11, 0.0])
+    small, large = 0.9 * TOLERANCE, 1.1 * TOLERANCE
+    found = make_infeasibility(clearance=[0.0, 0.2], poses=[small, 0.0], terms=[large, 0.0])
     assert merit.increase_weights(found, 0.1)
     increased = {"clearance": 2.0 * GROWTH, "terms": 2.0 * GROWTH}
     assert merit.weights == {**dict.fromkeys(KINDS, 2.0), **increased}
-    assert not merit.increase_weights(make_infeasibility(poses=[0.09, 0.0]), 0.1)
+    assert not merit.increase_weights(make_infeasibility(poses=[small]), 0.1)
+    assert not merit.increase_weights(make_infeasibility(clearance=[0.09]), 0.1)
+    for kind in set(KINDS) - {"clearance"}:
+        assert Merit(2.0).increase_weights(make_infeasibility(**{kind: [large]}), 0.1)
     merit.weights["clearance"] = MAX_WEIGHT  # the weight cannot increase further
     assert not merit.increase_weights(make_infeasibility(clearance=[0.2]), 0.1)

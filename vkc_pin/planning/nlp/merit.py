@@ -122,14 +122,17 @@ class Merit:
         kinds = (kind for kind in self.weights if clearance or kind != "clearance")
         return np.asarray(sum(self.weights[kind] * infeasibility.amounts[kind] for kind in kinds))
 
-    def increase_weights(self, infeasibility: Infeasibility, tolerance: float) -> bool:
-        """Increase the weights of kinds violated by more than `tolerance`; return whether any."""
-        amounts = infeasibility.amounts
-        increased = [
-            kind
-            for kind, weight in self.weights.items()
-            if weight < MAX_WEIGHT and amounts[kind].max(initial=0.0) > tolerance
-        ]
-        for kind in increased:
-            self.weights[kind] *= GROWTH
-        return bool(increased)
+    def increase_weights(self, infeasibility: Infeasibility, clearance_tolerance: float) -> bool:
+        """Increase the weights of violated kinds; return whether any increased.
+
+        A kind is violated where the solution would not be accepted: clearance above
+        `clearance_tolerance` [m], every other kind above `TOLERANCE`.
+        """
+        is_any_increased = False
+        for kind, weight in self.weights.items():
+            tolerance = clearance_tolerance if kind == "clearance" else TOLERANCE
+            largest = infeasibility.amounts[kind].max(initial=0.0)
+            if largest > tolerance and weight < MAX_WEIGHT:
+                self.weights[kind] = GROWTH * weight
+                is_any_increased = True
+        return is_any_increased

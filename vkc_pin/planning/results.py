@@ -11,7 +11,7 @@ import numpy as np
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan, PlanningStatistics
 from vkc_pin.planning.request import PlanningRequest
-from vkc_pin.planning.retiming.retime import retime_trajectory
+from vkc_pin.planning.retiming.retime import Close, retime_trajectory
 from vkc_pin.utils.budget import STOP_STATUSES, current_ending
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
@@ -152,13 +152,15 @@ def retime_validated(
     repairs: int = MAX_REPAIRS,
     jerk_time: float = 0.0,
     terms: Sequence[Term] = (),
+    close: Close | None = None,
 ) -> tuple[Trajectory, Report]:
     """Return a trajectory through waypoints and its report; the last one if none is valid.
 
     Around a violation the curve is made to pass through the middles of the straight segments too,
-    which the program has checked. Violated torque limits depend on no curve and are left alone.
-    `check` validates a trajectory, and `repairs` is the largest number of refinements. If one of
-    the user's traced `terms` depends on velocities, the program's own times are kept.
+    which the program has checked, with chains closed by `close`. Violated torque limits depend on
+    no curve and are left alone. `check` validates a trajectory, and `repairs` is the largest number
+    of refinements. If one of the user's traced `terms` depends on velocities, the program's own
+    times are kept.
     """
     if any(term.formula.uses_previous for term in terms):
         return waypoints, check(waypoints)
@@ -171,7 +173,7 @@ def retime_validated(
         if not near:
             break
         parts[[k for k in near if 0 <= k < len(parts)]] *= 2
-        trajectory = retime_trajectory(scene, waypoints, parts, jerk_time=jerk_time)
+        trajectory = retime_trajectory(scene, waypoints, parts, jerk_time=jerk_time, close=close)
         report = check(trajectory)
     return trajectory, report
 

@@ -7,6 +7,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -31,7 +32,7 @@ from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.results import MAX_REPAIRS, make_stationary_trajectory, retime_validated
 from vkc_pin.planning.solver.loop import solve
 from vkc_pin.planning.solver.solution import Iteration, Solution
-from vkc_pin.planning.solver.to_trajectory import make_trajectory
+from vkc_pin.planning.solver.to_trajectory import close_chains, make_trajectory
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.budget import (
     STOP_STATUSES,
@@ -408,6 +409,7 @@ class _Search:
             repairs=MAX_REPAIRS if solution.converged else 0,
             jerk_time=self.request.options.jerk_time,
             terms=self.request.terms,
+            close=partial(close_chains, problem),
         )
         took = time.perf_counter() - began
         self.times["retiming"] += took - (self.times["validation"] - validated)

@@ -49,3 +49,19 @@ def test_path_stays_within_limits(seed: int) -> None:
     np.testing.assert_allclose(path(path.x), waypoints, atol=1e-12)
     outside = fit_path(waypoints, np.ones(3), (lower + 0.1, upper))  # like some starts
     assert outside(np.linspace(path.x[0], path.x[-1], 500)).min() >= waypoints.min() - 1e-9
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10**6), st.floats(0.001, 1.0))
+def test_coordinates_that_move_together_stay_together_within_limits(
+    seed: int, ratio: float
+) -> None:
+    """The limits of one coordinate must not bend it away from another that it is coupled to."""
+    waypoints = sample_points(seed)
+    waypoints[1] = waypoints[0] + 1e-3 * (waypoints[1] - waypoints[0])  # tiny, then long steps
+    waypoints[:, 2] = -ratio * waypoints[:, 0]
+    lower, upper = waypoints.min(axis=0), waypoints.max(axis=0)
+    for limits in ((lower, upper), (np.append(lower[:2], -np.inf), np.append(upper[:2], np.inf))):
+        path = fit_path(waypoints, np.ones(3), limits)
+        found = path(np.linspace(path.x[0], path.x[-1], 300))
+        np.testing.assert_allclose(found[:, 2], -ratio * found[:, 0], atol=1e-9)

@@ -57,6 +57,23 @@ def test_base_rolls_through_waypoints_on_arcs(steps: list[tuple[float, float]]) 
     np.testing.assert_array_equal(np.concatenate(passed), points)
 
 
+@pytest.mark.parametrize("size", [5e-4, 1e-3, 2e-3, 5e-3])
+def test_short_steps_do_not_sway(size: float) -> None:
+    """A millimetre of base motion must not turn a hand at 1 m by more than a grasp may drift."""
+    lengths = size * np.array([0.7, 1.0, 1.4, 1.7, 2.0, 2.1])
+    turns = np.array([3.3, 4.4, 4.4, 3.9, 4.0, 5.5]) * 1e-3
+    points = make_arcs(list(zip(lengths.tolist(), turns.tolist(), strict=True)))
+    points[:, 3] = np.cumsum([0.0, 0.006, 0.077, 0.117, 0.129, 0.117, 0.08])  # the arm's
+    for path, own in fit_rolling_paths(points, SCALE, FAR, TANK):
+        along = np.linspace(path.x[0], path.x[-1], 400)
+        ends = path.x[:: (len(path.x) - 1) // (len(own) - 1)]
+        step = np.clip(np.searchsorted(ends, along, side="right") - 1, 0, len(own) - 2)
+        low = np.minimum(own[step, 2], own[step + 1, 2])
+        high = np.maximum(own[step, 2], own[step + 1, 2])
+        yaw = path(along)[:, 2]
+        assert np.maximum(yaw - high, low - yaw).max() < 1e-3
+
+
 def make_smooth_drive(count: int) -> np.ndarray:
     """Return poses on a winding curve of small arcs that turns in place and reverses."""
     s = np.linspace(0.0, 1.0, 3000 * count + 1)

@@ -12,8 +12,10 @@ from helpers.carrying import STICK, describe_table, lift, make_room
 from helpers.held_sticks import make_scene_with_held_stick
 from helpers.small_problems import SHORT, load_door_scene, make_program, sample_configurations
 
+from vkc_pin.planning.initialization.methods import initialize
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.solver.to_trajectory import make_trajectory
+from vkc_pin.planning.solver.loop import solve
+from vkc_pin.planning.solver.to_trajectory import close_chains, make_trajectory
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Release, Step
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
@@ -128,3 +130,32 @@ def test_robot_and_grasp_coordinates_follow_the_waypoints(
         held = [k for k, phase in enumerate(problem.task.phases) if hold in phase.held]
         nearest = np.clip(np.arange(len(rows)), ends[held[0]], ends[held[-1] + 1])
         np.testing.assert_array_equal(rows[:, columns], path[nearest][:, columns])
+
+
+def test_chains_are_closed_between_waypoints_by_the_arm_alone() -> None:
+    problem = make_program(load_door_scene(), [Actuate("door", {"hinge": 1.2})], options=SHORT)
+    z = solve(problem, initialize(problem, "interpolated", 0).__next__().z).z
+    motion = make_trajectory(problem, z, problem.timing_for(z).dt)
+    middles = np.arange(len(motion.positions) - 1) + 0.5
+    straight = (motion.positions[1:] + motion.positions[:-1]) / 2
+    closed = close_chains(problem, straight, middles)
+    (goal,) = (goal for goal in problem.pose_goals if goal.kind == "closure")
+    (solver,) = (
+        solver
+        for one, solver in zip(problem.pose_goals, problem.transcription.pose_solvers, strict=True)
+        if one is goal
+    )
+    is_held = np.array(
+        [
+            any(phase.first <= row < phase.last and phase.held for phase in motion.phases)
+            for row in range(len(straight))
+        ]
+    )
+    before = np.abs(solver.evaluate(straight[is_held], goal.target)[0]).max(axis=1)
+    after = np.abs(solver.evaluate(closed[is_held], goal.target)[0]).max(axis=1)
+    assert before.max() > 1e-4, "straight lines keep the closure"
+    assert after.max() < 1e-6
+    robot = problem.chain.robot.coordinates.size
+    np.testing.assert_array_equal(closed[:, :3], straight[:, :3])
+    np.testing.assert_array_equal(closed[:, robot:], straight[:, robot:])
+    np.testing.assert_array_equal(closed[~is_held], straight[~is_held])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -26,7 +26,7 @@ from vkc_pin.world.trajectory.wheels import RollingLimits, make_rolling_limits
 if TYPE_CHECKING:
     from scipy.interpolate import CubicHermiteSpline
 
-__all__ = ["retime_trajectory"]
+__all__ = ["Close", "retime_trajectory"]
 
 _MIN_PIECES = 3  # minimum pieces per step; the path velocity is linear in time in each
 _MIN_JOINT_STEP = 1e-6  # [m] or [rad], smaller steps of an object's joint count as none
@@ -45,8 +45,18 @@ _MAX_SLIP = 2e-4
 _MAX_REFINEMENT = 8  # of the knots
 
 
+Close = Callable[[Floats, Floats], Floats]
+"""Moves points between waypoints onto the closure manifold: points, shape (M, n), and the waypoint
+of each with the fraction of the way to the next, shape (M,) → points, shape (M, n)."""
+
+
 def retime_trajectory(
-    scene: Scene, trajectory: Trajectory, parts: Ints | None = None, *, jerk_time: float = 0.0
+    scene: Scene,
+    trajectory: Trajectory,
+    parts: Ints | None = None,
+    *,
+    jerk_time: float = 0.0,
+    close: Close | None = None,
 ) -> Trajectory:
     """Return a smooth trajectory through the same waypoints, as fast as its limits allow.
 
@@ -65,12 +75,13 @@ def retime_trajectory(
         parts: Number of parts of each straight line between waypoints, shape (T − 1,). The path
             passes through the ends of all parts. Defaults to one.
         jerk_time: See `Options.jerk_time`.
+        close: Closes chains where lines are parted, which straight lines of the coordinates open.
     """
     limits = Limits.from_scene(scene, trajectory.names, jerk_time)
     parts = np.ones(len(trajectory.times) - 1, int) if parts is None else parts
     rolling = make_rolling_limits(scene.robot)
     places = np.concatenate([[0], np.cumsum(parts)])  # indices of the waypoints among all points
-    positions = _subdivide(trajectory.positions, places, rolling)
+    positions = _subdivide(trajectory.positions, places, rolling, close)
     scale = 1.0 / np.where(np.isfinite(limits.velocity), limits.velocity, 1.0)
     lengths = np.linalg.norm(np.diff(positions, axis=0) * scale, axis=1)
     is_still = lengths <= _MIN_STEP_DURATION
@@ -99,15 +110,21 @@ def retime_trajectory(
     return replace(trajectory, times=curve.times[np.array(ends)[places]], curve=curve)
 
 
-def _subdivide(positions: Floats, places: Ints, rolling: RollingLimits) -> Floats:
+def _subdivide(
+    positions: Floats, places: Ints, rolling: RollingLimits, close: Close | None
+) -> Floats:
     """Return waypoints, (T, n), and points on the lines (wheeled bases: arcs) between them."""
     every = np.arange(places[-1] + 1)
     at = np.interp(every, places, np.arange(len(places)))
     points = np.stack([np.interp(every, places, column) for column in positions.T], axis=-1)
-    if rolling.is_omnidirectional or len(points) == len(positions):
+    if len(points) == len(positions):
         return points
-    step = np.minimum(at.astype(int), len(positions) - 2)
-    points[:, :3] = interpolate_arcs(positions[step, :3], positions[step + 1, :3], at - step)
+    if not rolling.is_omnidirectional:
+        step = np.minimum(at.astype(int), len(positions) - 2)
+        points[:, :3] = interpolate_arcs(positions[step, :3], positions[step + 1, :3], at - step)
+    if close is not None:
+        inserted = np.setdiff1d(every, places)
+        points[inserted] = close(points[inserted], at[inserted])
     return points
 
 

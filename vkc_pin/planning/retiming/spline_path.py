@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vkc_pin.utils.arrays import Bools, Floats
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.trajectory.curve import Curve
 
 if TYPE_CHECKING:
@@ -19,9 +19,10 @@ def fit_path(points: Floats, scale: Floats, limits: tuple[Floats, Floats]) -> Cu
     """Return a cubic spline through waypoints, parametrised by the length of the polyline.
 
     It is twice differentiable and linear in the waypoints, so that linear constraints that hold at
-    all waypoints hold along it. If a coordinate would leave its limits between waypoints, it stays
-    between the values at consecutive waypoints (Hyman, Accurate monotonicity preserving cubic
-    interpolation, 1983).
+    all waypoints hold along it. If a coordinate would leave its limits between waypoints, all stay
+    between their values at consecutive waypoints (Hyman, Accurate monotonicity preserving cubic
+    interpolation, 1983): where only one did, the others would overshoot without it, and a chain
+    that is closed at the waypoints would open.
 
     Args:
         points: Waypoints, shape (m, n), m ≥ 2, consecutive ones distinct.
@@ -39,20 +40,21 @@ def fit_path(points: Floats, scale: Floats, limits: tuple[Floats, Floats]) -> Cu
         if len(points) > 2
         else np.repeat(chords, 2, axis=0)
     )
-    overshoots = _find_overshoots(points, slopes, lengths, limits)
+    if not _exceeds_limits(points, slopes, lengths, limits):
+        return CubicHermiteSpline(arc_lengths, points, slopes)
     before, after = np.vstack([chords[:1], chords]), np.vstack([chords, chords[-1:]])
     directions, steepest = np.sign(after), 3.0 * np.minimum(np.abs(before), np.abs(after))
     monotone = np.where(
         before * after > 0.0, directions * np.clip(directions * slopes, 0.0, steepest), 0.0
     )
-    return CubicHermiteSpline(arc_lengths, points, np.where(overshoots, monotone, slopes))
+    return CubicHermiteSpline(arc_lengths, points, monotone)
 
 
-def _find_overshoots(
+def _exceeds_limits(
     points: Floats, slopes: Floats, lengths: Floats, limits: tuple[Floats, Floats]
-) -> Bools:
-    """Return a mask of coordinates whose cubics exceed limits between two points, shape (n,)."""
+) -> bool:
+    """Return whether the cubic of any coordinate exceeds its limits between two points."""
     low, high = Curve(np.concatenate([[0.0], np.cumsum(lengths)]), points, slopes).compute_extrema()
     is_low = low < np.minimum(limits[0], np.minimum(points[:-1], points[1:]))
     is_high = high > np.maximum(limits[1], np.maximum(points[:-1], points[1:]))
-    return np.asarray((is_low | is_high).any(axis=0))
+    return bool((is_low | is_high).any())

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,6 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
 from vkc_pin.importing.objects.clean_up import (
-    add_missing_limits,
     choose_name,
     compute_bounds,
     find_multiple_objects,
@@ -130,22 +128,6 @@ def test_separate_objects_in_one_file_are_noted(
     notes = find_multiple_objects(make_description(links, joints))
     assert len(notes) == bool(note)
     assert note in "".join(notes)
-
-
-def test_missing_limits_open_outwards(cabinet: Description) -> None:
-    found = merge_fixed_links(cabinet)
-    limited = add_missing_limits(found, load_surfaces(found))
-    low, high = limited.joints["link_1"].limits or (0.0, 0.0)
-    assert sorted(map(abs, (low, high))) == pytest.approx([0.0, np.pi / 2])
-    depths = [np.ptp(compute_box(limited, joint_1=value), axis=0)[0] for value in (0.0, low + high)]
-    assert depths[1] > depths[0] + 0.1  # the door opens to the front, along x
-    assert any("joint_1" in note and "1.57" in note for note in limited.notes)
-    assert limited.joints["link_0"].limits == (0.0, 0.36)
-    # 1.57 read as degrees
-    narrow = dataclasses.replace(limited.joints["link_1"], limits=(0.0, 0.0274))
-    degrees = dataclasses.replace(limited, joints={**limited.joints, "link_1": narrow})
-    notes = add_missing_limits(degrees, load_surfaces(degrees)).notes
-    assert any("only 1.6°" in note or "only 2°" in note for note in notes)
 
 
 @given(st.lists(st.text(max_size=5), max_size=8))

@@ -8,8 +8,8 @@ import pytest
 import trimesh
 
 from vkc_pin.errors import InputError
-from vkc_pin.importing.objects.clean_up import add_missing_limits, load_surfaces
 from vkc_pin.importing.objects.description import Description
+from vkc_pin.importing.objects.limits import add_missing_limits
 from vkc_pin.importing.objects.object_import import read_description
 from vkc_pin.importing.objects.sdf import read_object_sdf
 
@@ -203,7 +203,7 @@ def test_limits_may_be_one_sided(
 ) -> None:
     found = read_chest(tmp_path, lower=lower, upper=upper)
     assert found.joints["front"].limits == limits
-    completed = add_missing_limits(found, load_surfaces(found))
+    completed = add_missing_limits(found)
     assert completed.joints["front"].limits == pytest.approx(assumed)
     assert completed.notes
 

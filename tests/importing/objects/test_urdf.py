@@ -111,7 +111,7 @@ def test_inertia_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("kind", "limit", "expected"),
     [
-        ("revolute", 'lower="-1.79769e308" upper="1.79769e308"', ("continuous", None)),
+        ("revolute", 'lower="-1.79769e308" upper="1.79769e308"', ("revolute", None)),
         ("revolute", 'lower="-1e16" upper="1.5"', ("revolute", (-np.inf, 1.5))),
         ("prismatic", 'lower="-1e16" upper="1e16"', ("prismatic", None)),
         ("prismatic", 'lower="0" upper="2147483647"', ("prismatic", (0.0, np.inf))),

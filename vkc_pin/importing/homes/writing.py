@@ -16,7 +16,6 @@ import pinocchio as pin
 
 from vkc_pin.importing.homes.splitting import Home, HomeObject
 from vkc_pin.importing.objects.clean_up import (
-    add_missing_limits,
     choose_name,
     compute_bounds,
     load_surfaces,
@@ -24,6 +23,7 @@ from vkc_pin.importing.objects.clean_up import (
     move_root,
 )
 from vkc_pin.importing.objects.description import Colour, Description, Joint, Link, Part
+from vkc_pin.importing.objects.limits import add_missing_limits
 from vkc_pin.importing.objects.pieces import PieceCache, decompose_links
 from vkc_pin.importing.objects.writing import write_description, write_urdf
 from vkc_pin.importing.proposals.proposal import Proposals
@@ -119,8 +119,8 @@ def write_object(
     description = merge_fixed_links(item.description)
     if item.free:
         description = _add_lift_joint(description)
-    description = add_missing_limits(description, load_surfaces(description))
     description = decompose_links(description, load_surfaces(description), cache)
+    description = add_missing_limits(description)
     address = f"objects/{stem}/{stem}.yaml"
     yaml, urdf = folder / address, (folder / address).with_suffix(".urdf")
     with tempfile.TemporaryDirectory() as scratch:

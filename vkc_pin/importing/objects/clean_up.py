@@ -1,4 +1,4 @@
-"""Prepares an imported description for planning: names, fixed links, limits, scale and axes."""
+"""Prepares an imported description for planning: names, fixed links, scale and axes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 __all__ = [
     "MOVING",
     "Surfaces",
-    "add_missing_limits",
     "choose_name",
     "collect_attached_links",
     "compute_bounds",
@@ -32,6 +31,7 @@ __all__ = [
     "make_upright",
     "merge_fixed_links",
     "move_root",
+    "place_vertices",
     "rename",
     "rename_for_scenes",
     "scale_object",
@@ -41,9 +41,6 @@ MOVING = ("revolute", "continuous", "prismatic")
 """Kinds of joints that have a position."""
 Surfaces = Mapping[int, "trimesh.Trimesh"]
 """Surfaces of parts in the frame of their link, by `id` of the part."""
-_OPEN = np.pi / 2.0  # [rad] opening angle of hinges without limits
-_TINY_RANGE = 0.05  # [rad] hinge ranges below this suggest a wrong unit
-_PULLED = 0.8  # travel of drawers without limits, relative to their depth
 _UP = {"z": np.eye(3), "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])}
 
 
@@ -232,7 +229,7 @@ def compute_bounds(
 ) -> tuple[Floats, Floats]:
     """Return the bounding box of the collision geometry in the root's frame [m]."""
     placements = description.compute_placements(values)
-    points = _place_vertices(description, meshes, placements, description.links)
+    points = place_vertices(description, meshes, placements, description.links)
     if not points:
         notes = "; ".join(description.notes[:3])  # they say what was left out
         raise InputError(
@@ -245,7 +242,7 @@ def compute_bounds(
     return vertices.min(axis=0), vertices.max(axis=0)
 
 
-def _place_vertices(
+def place_vertices(
     description: Description,
     meshes: Surfaces,
     placements: Mapping[str, pin.SE3],
@@ -317,51 +314,3 @@ def move_root(description: Description, placement: pin.SE3) -> Description:
         for child, joint in description.joints.items()
     }
     return dataclasses.replace(description, links=links, joints=joints)
-
-
-def _complete_limits(limits: tuple[float, float], travel: float) -> tuple[float, float]:
-    """Return limits of which one is infinite with the other at 0, or else a travel away."""
-    low, high = limits
-    if np.isinf(high):
-        return low, 0.0 if low < 0.0 else low + travel
-    return 0.0 if high > 0.0 else high - travel, high
-
-
-def add_missing_limits(description: Description, meshes: Surfaces) -> Description:
-    """Return the object with limits for joints that state none, each noted.
-
-    A hinge opens by a right angle, a drawer by most of its depth, in the direction that moves the
-    part away from the centre of the object. A joint with one limit other than 0 opens from 0 to it.
-    """
-    joints, notes = dict(description.joints), list(description.notes)
-    placements, (low, high) = description.compute_placements(), compute_bounds(description, meshes)
-    for child, joint in description.joints.items():
-        if (
-            joint.kind == "revolute"
-            and joint.limits is not None
-            and np.ptp(joint.limits) < _TINY_RANGE
-        ):
-            degrees = float(np.degrees(np.ptp(joint.limits)))
-            unit = "are its limits in another unit (MJCF: `angle` of <compiler>)?"
-            notes.append(f"joint '{joint.name}' has a range of only {degrees:.1g}°: {unit}")
-        ends = joint.limits or (-np.inf, np.inf)
-        if joint.kind not in ("revolute", "prismatic") or np.isfinite(ends).all():
-            continue
-        below = description.subtree(child)
-        points = np.vstack(_place_vertices(description, meshes, placements, below))
-        centre = (points.min(axis=0) + points.max(axis=0)) / 2.0
-        direction = axis = placements[child].rotation @ joint.axis
-        if joint.kind == "revolute":
-            direction = np.cross(axis, centre - placements[child].translation)
-        sign = 1.0 if direction @ (centre - (low + high) / 2.0) >= 0.0 else -1.0
-        travel = _OPEN if joint.kind == "revolute" else _PULLED * float(np.ptp(points @ axis))
-        limits = (0.0, travel) if sign > 0.0 else (-travel, 0.0)
-        about, reason = "no limits", ", away from centre"
-        if np.isfinite(ends).any():
-            about, reason = f"no {'lower' if np.isinf(ends[0]) else 'upper'} limit", ""
-            limits = _complete_limits(ends, travel)
-        joints[child] = dataclasses.replace(joint, limits=limits)
-        unit = "rad" if joint.kind == "revolute" else "m"
-        chosen = f"{limits[0]:.3g} to {limits[1]:.3g} {unit}"
-        notes.append(f"joint '{joint.name}' states {about}: {chosen} assumed{reason}")
-    return dataclasses.replace(description, joints=joints, notes=tuple(notes))

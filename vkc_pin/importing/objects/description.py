@@ -108,7 +108,8 @@ class Joint:
 
     Attributes:
         name: Joint name.
-        kind: "fixed", "revolute", "continuous" or "prismatic"; in homes also "floating".
+        kind: "fixed", "revolute", "prismatic" or, if the file says that it turns without end,
+            "continuous"; in homes also "floating".
         parent, child: Names of the links.
         placement: Placement of the child's frame in the parent's.
         axis: Unit axis in the child's frame, shape (3,).

@@ -108,7 +108,7 @@ class _Reader:
             limits = make_limits(low, high)
         return Joint(
             name=name,
-            kind="continuous" if kind == "revolute" and limits is None else kind,
+            kind=kind,
             parent=parent,
             child=child,
             placement=frames[parent].inverse() * frames[child],

@@ -15,7 +15,6 @@ import pinocchio as pin
 from vkc_pin.errors import InputError
 from vkc_pin.importing.formats import check_no_arguments, read_root
 from vkc_pin.importing.objects.clean_up import (
-    add_missing_limits,
     compute_bounds,
     extract_subtree,
     find_closed_positions,
@@ -28,6 +27,7 @@ from vkc_pin.importing.objects.clean_up import (
     scale_object,
 )
 from vkc_pin.importing.objects.description import WEIGHTLESS, Description
+from vkc_pin.importing.objects.limits import add_missing_limits
 from vkc_pin.importing.objects.mjcf import read_object_mjcf
 from vkc_pin.importing.objects.pieces import decompose_links
 from vkc_pin.importing.objects.sdf import read_object_sdf
@@ -230,11 +230,11 @@ def import_object(  # noqa: PLR0913 - keyword options of a public call
     )
     description = make_upright(merge_fixed_links(rename_for_scenes(description)), up)
     description, size = _scale_to_size(description, height, scale)
-    meshes = load_surfaces(description)
-    description = _place_on_floor(add_missing_limits(description, meshes))
+    description = _place_on_floor(description)
     if description.is_massless:
         description = dataclasses.replace(description, notes=(*description.notes, WEIGHTLESS))
     description = decompose_links(description, load_surfaces(description))
+    description = add_missing_limits(description)
     with write_folder_atomically(
         target, force=True
     ) as staging:  # `check_target` allowed replacing it

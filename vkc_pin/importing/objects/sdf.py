@@ -392,8 +392,6 @@ class _Reader:
             settings |= self._read_dynamics(scope, element, name)
             if element.find("mimic") is not None:
                 self.notes.append(f"joint '{name}' mimics another one: made independent")
-        if kind == "revolute" and limits is None:
-            kind = "continuous"
         return Joint(
             name=name,
             kind=kind,

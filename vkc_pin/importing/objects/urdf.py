@@ -65,6 +65,8 @@ def read_object_urdf(
                 f"joint '{joint.get('name')}' mimics '{mimic.get('joint')}': made independent"
             )
             joint.remove(mimic)
+    # `check_tree` makes hinges with huge limits continuous.
+    kinds = {joint.get("name", ""): joint.get("type", "") for joint in root.findall("joint")}
     check_tree(file, root)
     urdf = UrdfFile(file.resolve(), "", root, packages or {})
     notes += replace_missing_meshes(urdf, every_link=True)
@@ -97,9 +99,10 @@ def read_object_urdf(
         )
         for name in urdf.links
     }
-    joints = [
-        _read_joint(file, joint, stated[joint.get("name", "")]) for joint in root.findall("joint")
-    ]
+    joints = []
+    for joint in root.findall("joint"):
+        name = joint.get("name", "")
+        joints.append(_read_joint(file, joint, kinds[name], stated[name]))
     return Description(file, links, {joint.child: joint for joint in joints}, tuple(notes))
 
 
@@ -161,9 +164,9 @@ def _make_placement(origin: tuple[tuple[float, ...], tuple[float, ...]]) -> pin.
 
 
 def _read_joint(
-    file: Path, element: ElementTree.Element, limits: tuple[float, float] | None
+    file: Path, element: ElementTree.Element, kind: str, limits: tuple[float, float] | None
 ) -> Joint:
-    name, kind = element.get("name", ""), element.get("type", "")
+    name = element.get("name", "")
     axis, limit = element.find("axis"), element.find("limit")
     direction = np.array([1.0, 0.0, 0.0])
     if axis is not None and kind not in ("fixed", "floating"):

@@ -10,18 +10,19 @@ import pinocchio as pin
 
 from vkc_pin.importing.mjcf_models import NO_MASS, compile_mjcf
 from vkc_pin.importing.objects.description import Description, Joint, Link, Part, make_limits
+from vkc_pin.importing.objects.mjcf_equalities import FREE, list_joints, read_equalities
 from vkc_pin.utils.optional_imports import import_optional
 
 __all__ = ["read_object_mjcf"]
 
-_FREE = 0  # type of a free joint
 _HIDDEN = 3  # first group that MuJoCo's viewer hides; by convention, collision geometry
 
 
 def read_object_mjcf(file: Path, *, free: bool = False) -> Description:
     """Read the description of an object or a home from an MJCF file.
 
-    Everything fixed in the world becomes one link, `world`.
+    Everything fixed in the world becomes one link, `world`. Active equalities hold joints and
+    attach free bodies; see `read_equalities`.
 
     Args:
         file: The file.
@@ -42,52 +43,74 @@ class _Reader:
         names = [str(model.body(k).name) for k in range(model.nbody)]
         self.taken = set(filter(None, names))
         self.bodies = [name or self._add_name(f"body_{k}") for k, name in enumerate(names)]
+        self.equalities = read_equalities(mujoco, model)
 
     def read(self, *, free: bool) -> Description:
-        model = self.model
+        """Return the description; see `read_object_mjcf`."""
+        self.notes += self.equalities.notes
         frames, links, joints = dict[str, pin.SE3](), dict[str, Link](), dict[str, Joint]()
-        left_out: set[int] = set()
-        for body in range(model.nbody):
-            name, parent = self.bodies[body], int(model.body_parentid[body])
-            above = self.bodies[parent]
-            moving = range(
-                int(model.body_jntadr[body]),
-                int(model.body_jntadr[body]) + int(model.body_jntnum[body]),
-            )
-            if parent in left_out and body:
-                left_out.add(body)
+        kept = [body for body in range(self.model.nbody) if free or not self._is_separate(body)]
+        # A body whose frame is moved to its last joint may carry bodies of smaller numbers.
+        frames |= {self.bodies[body]: self._find_frame(body) for body in kept}
+        for body in range(self.model.nbody):
+            name = self.bodies[body]
+            if body not in kept:
+                if self._is_free(body):
+                    self.notes.append(f"body '{name}' is free, hence a separate object: left out")
                 continue
-            placement = _placement(self.data.xpos[body], self.data.xmat[body])
-            is_free = any(int(model.jnt_type[j]) == _FREE for j in moving)
-            if is_free and not free:
-                self.notes.append(f"body '{name}' is free, hence a separate object: left out")
-                left_out.add(body)
-                continue
-            if is_free:  # a free body has no other joints
-                moving = range(0)
-            last = above
+            last = self.bodies[self._find_parent(body)]
             # Several joints of one body are connected by links without shapes.
+            moving = self._list_joints(body)
             for count, j in enumerate(moving):
                 link = name if count == len(moving) - 1 else self._add_name(f"{name}_{count}")
-                frames[link] = pin.SE3(placement.rotation, np.array(self.data.xanchor[j]))
+                frames[link] = self._find_joint_frame(body, j)
                 joints[link] = self._read_joint(j, last, link, frames)
                 links[link] = Link(link)
                 last = link
-            if not len(moving):
-                frames[name] = placement
-                if body:
-                    kind = "floating" if is_free else "fixed"
-                    joints[name] = Joint(
-                        name=f"{name}_{kind}",
-                        kind=kind,
-                        parent=above,
-                        child=name,
-                        placement=frames[above].inverse() * placement,
-                    )
+            if body and not moving:
+                kind = "floating" if self._is_free(body) else "fixed"
+                joints[name] = Joint(
+                    name=f"{name}_{kind}",
+                    kind=kind,
+                    parent=last,
+                    child=name,
+                    placement=frames[last].inverse() * frames[name],
+                )
             links[name] = Link(
                 name, *self._read_shapes(body, frames[name]), self._read_inertia(body, frames[name])
             )
         return Description(self.file, links, joints, tuple(self.notes))
+
+    def _is_free(self, body: int) -> bool:
+        """Return whether a body has a free joint, and no equality attaches it to another."""
+        is_floating = any(
+            int(self.model.jnt_type[j]) == FREE for j in list_joints(self.model, body)
+        )
+        return is_floating and body not in self.equalities.attached
+
+    def _is_separate(self, body: int) -> bool:
+        """Return whether a body is free or on a free one."""
+        while body and not self._is_free(body):
+            body = self._find_parent(body)
+        return body > 0
+
+    def _find_parent(self, body: int) -> int:
+        return self.equalities.attached.get(body, int(self.model.body_parentid[body]))
+
+    def _list_joints(self, body: int) -> list[int]:
+        """Return the joints of a body, without free ones."""
+        joints = list_joints(self.model, body)
+        return [j for j in joints if int(self.model.jnt_type[j]) != FREE]
+
+    def _find_frame(self, body: int) -> pin.SE3:
+        """Return the frame of a body's link: that of the body, moved to its last joint."""
+        moving = self._list_joints(body)
+        if moving:
+            return self._find_joint_frame(body, moving[-1])
+        return _placement(self.data.xpos[body], self.data.xmat[body])
+
+    def _find_joint_frame(self, body: int, joint: int) -> pin.SE3:
+        return _placement(self.data.xanchor[joint], self.data.xmat[body])
 
     def _read_joint(
         self, number: int, parent: str, child: str, frames: dict[str, pin.SE3]
@@ -106,7 +129,7 @@ class _Reader:
         if model.jnt_limited[number]:
             low, high = (float(value) - zero for value in model.jnt_range[number])
             limits = make_limits(low, high)
-        return Joint(
+        joint = Joint(
             name=name,
             kind=kind,
             parent=parent,
@@ -119,6 +142,8 @@ class _Reader:
             stiffness=float(np.ravel(model.jnt_stiffness[number])[0]),
             springref=float(model.qpos_spring[address]) - zero,
         )
+        held = self.equalities.held
+        return joint.fix(held[number]) if number in held else joint
 
     def _read_inertia(self, body: int, frame: pin.SE3) -> pin.Inertia:
         """Return a body's inertia as stated, or as MuJoCo computes it from its geoms' densities."""

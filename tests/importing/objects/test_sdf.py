@@ -85,7 +85,6 @@ QUATERNION = ' rotation_format="quat_xyzw"'
         {"attributes": ' relative_to="f"', "pose": "0 0 0.1 0 0 0", "model": FRAMES},
         {"attributes": ' relative_to="g"', "pose": " 0 0 0.1 \n 0\t0 0 ", "model": FRAMES},
         {"attributes": ' frame="case"', "pose": "-0.22 0 0.1 0 0 0", "version": "1.6"},
-        {"attributes": ' frame="case"', "version": "1.7"},
         {"attributes": ' relative_to=""'},
         {"attributes": ' relative_to="__model__"'},
         {"attributes": ' relative_to="world"'},
@@ -149,6 +148,39 @@ def test_version_determines_the_frame_of_the_axis(
     x, y, z = axis
     np.testing.assert_allclose(find_axis(yawed, "front"), [-y, x, z], atol=1e-9)
     np.testing.assert_allclose(np.ptp(compute_box(yawed, "case"), axis=0), [0.6, 0.4, 0.8])
+
+
+PARENT_FRAME = "<use_parent_model_frame>{}</use_parent_model_frame>"
+
+
+@pytest.mark.parametrize(
+    ("changes", "left_out"),
+    [
+        ({"version": "1.7", "flag": PARENT_FRAME.format("1")}, "<use_parent_model_frame>"),
+        ({"version": "1.11", "flag": PARENT_FRAME.format(" true ")}, "<use_parent_model_frame>"),
+        ({"version": "1.7", "flag": PARENT_FRAME.format("0")}, ""),  # as in every version since
+        ({"version": "1.6", "flag": PARENT_FRAME.format("1")}, ""),
+        ({"version": "1.5", "flag": PARENT_FRAME.format("0")}, ""),
+        ({"version": "1.4", "flag": PARENT_FRAME.format("0")}, "<use_parent_model_frame>"),
+        ({"version": "1.4", "flag": PARENT_FRAME.format("1")}, ""),  # as in every version before
+        ({"version": "1.7", "attributes": ' frame="case"'}, "`frame` of <pose>"),
+        ({"version": "1.9", "attributes": ' frame="nothing"'}, "`frame` of <pose>"),
+        ({"version": "1.6", "attributes": ' frame="case"'}, ""),
+        ({"version": "1.7", "attributes": ' relative_to="case"'}, ""),
+    ],
+)
+def test_settings_of_other_versions_are_noted(
+    tmp_path: Path, changes: dict[str, str], left_out: str
+) -> None:
+    axis = f"<xyz>-1 0 0</xyz>{changes.pop('flag', '')}"
+    found = read_chest(tmp_path, axis=axis, **changes)
+    version = changes["version"]
+    assert len(found.notes) == bool(left_out)
+    if "pose" in left_out:
+        np.testing.assert_allclose(compute_box(found)[0], [-0.23, -0.28, 0.35], atol=1e-9)
+    for note in found.notes:
+        assert note.startswith("t.sdf:")
+        assert note.endswith(f": {left_out} does not belong to SDF {version}: left out")
 
 
 @pytest.mark.parametrize("free", [False, True])

@@ -118,7 +118,9 @@ class _Reader:
             self.notes.append(f"{file.name} states no version: read as SDF 1.{version}")
         if version > _NEWEST:
             self.notes.append(f"{file.name} has version 1.{version}: read as SDF 1.{_NEWEST}")
-        return root, next(rules for rules in reversed(RULES) if rules.since <= version)
+        rules = next(rules for rules in reversed(RULES) if rules.since <= version)
+        self.notes += _note_other_versions(file, root, rules, version)
+        return root, rules
 
     def _make_scope(self, scope: Scope, files: tuple[Path, ...]) -> Scope:
         """Fill in the elements of a model or world; `files` are those that include it."""
@@ -583,6 +585,23 @@ class _Reader:
         values = scope.read_numbers(material, "diffuse", len(rgba), "", name)
         red, green, blue, opacity = (*values, 1.0)[:4] if len(values) >= 3 else (0.8, 0.8, 0.8, 1.0)
         return red, green, blue, opacity
+
+
+def _note_other_versions(
+    file: Path, root: ElementTree.Element, rules: Rules, version: int
+) -> Iterator[str]:
+    """Yield a note about each setting that another version has, and that would matter there."""
+    for element in root.iter():
+        name = None
+        if element.tag == "use_parent_model_frame" and rules.axis_frame != element.tag:
+            # Up to 1.4 axes are in the model's frame, from 1.7 on in the joint's.
+            is_other = is_true(element.text or "") == (rules.axis_frame is not None)
+            name = f"<{element.tag}>" if is_other else None
+        elif element.tag == "pose" and rules.pose_frame != "frame" and element.get("frame"):
+            name = "`frame` of <pose>"
+        if name is not None:
+            where = f"{file.name}:{find_line(element)}"
+            yield f"{where}: {name} does not belong to SDF 1.{version}: left out"
 
 
 def _find_model(file: Path, include: ElementTree.Element, packages: Mapping[str, Path]) -> Path:

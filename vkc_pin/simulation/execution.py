@@ -19,9 +19,10 @@ from vkc_pin.simulation.friction import (
     limit_finger_servos,
     split_spans,
 )
+from vkc_pin.simulation.goals import measure_goal_errors
 from vkc_pin.simulation.model import Builder, PhysicalWorld
 from vkc_pin.simulation.physics import Physics, complete_inertias, import_mujoco
-from vkc_pin.simulation.result import SimulationResult, Tracking, measure_goal_errors
+from vkc_pin.simulation.result import SimulationResult, Tracking
 from vkc_pin.simulation.servos import (
     Servo,
     compute_feedforward,
@@ -48,6 +49,10 @@ _FRICTION_STEP = 5e-4  # [s] longest time step with friction grasps; see `Builde
 # when they carry it
 _CLOSED_TIME = 0.2
 _FRAME_PERIOD = 0.02  # [s] between recorded states
+_BALANCE_TIME = 0.5  # [s] in which servos settle under load: ten time constants of the slowest
+_BALANCED = 1e-8  # [m] or [rad] by which servos at rest still give way
+# After each round a hundredth of the deflection is left, of up to 0.05 rad; contacts may chatter.
+_BALANCE_ROUNDS = 8
 _CONTACT_PERIOD = 0.01  # [s] between two recordings of contacts
 _MAX_STEPS = 2_000_000  # time steps, of which each keeps a row: 1.1 h at 2 ms
 
@@ -209,17 +214,11 @@ class _Run:
         data = mj.MjData(model)
         data.qpos[:] = self.physical.to_qpos(self.tree.start)
         mj.mj_forward(model, data)
-        motion = sample_reference(self.trajectory, self.times)
-        fingers = sample_fingers(self.tree, self.planned, self.trajectory.times, self.times)
-        targets = np.column_stack([motion[0], fingers])
-        feedforward = compute_feedforward(self.tree, self.servos, targets, motion)
-        count = motion[1].shape[1]
-        feedforward[:, :count] += motion[1] * [servo.damping for servo in self.servos[:count]]
-        commands = targets + feedforward / [servo.stiffness for servo in self.servos]
+        targets, commands = self._sample_commands()
         if self.squeezes is not None and self.fingers is not None:
             finger_columns, finger_motors = self.fingers.find_addresses(self.physical)
             open_fingers = (
-                fingers
+                targets[:, self.trajectory.robot_size :]
                 if self.fingers.sides is None
                 else np.zeros((len(self.times), len(finger_columns)))
             )
@@ -227,6 +226,12 @@ class _Run:
         driven, dofs = (
             where[: len(self.servos)] for where in (self.physical.columns, self.physical.dofs)
         )
+        self.grips.follow(data, float(self.times[0]))
+        self.latches.follow(data)
+        data.ctrl[: len(self.servos)] = commands[0]
+        if self.squeezes is not None:
+            data.ctrl[finger_motors] = squeeze[0]
+        commands += self._balance_load(data)
         labels = np.zeros(model.ngeom, int)
         labels[self.physical.geoms] = np.arange(len(self.physical.geoms))
         contact_steps, frame_steps = (
@@ -237,7 +242,6 @@ class _Run:
             k for k in range(len(self.times)) if k % frame_steps == 0 or k == len(self.times) - 1
         ]
         self.clocks, records = self.times[recorded], list[Floats]()
-        diverging = [getattr(mj.mjtWarning, f"mjWARN_BADQ{name}") for name in ("POS", "VEL", "ACC")]
         for k, clock in enumerate(self.times.tolist()):
             self.grips.follow(data, clock)
             self.latches.follow(data)
@@ -250,9 +254,7 @@ class _Run:
             mj.mj_step(model, data)
             self.efforts[k] = data.qfrc_actuator[dofs]
             # MuJoCo resets a state that diverged; it has no welds then.
-            if not np.isfinite(data.qpos).all() or any(
-                data.warning[kind].number for kind in diverging
-            ):
+            if self._has_diverged(data):
                 self.diverged, end = clock, k + 1
                 self.times, self.errors = self.times[:end], self.errors[:end]
                 self.efforts = self.efforts[:end]
@@ -265,6 +267,62 @@ class _Run:
         # After a divergence the last state is repeated.
         records += [records[-1]] * (len(recorded) - len(records))
         self.states: Floats = np.array(records)
+
+    def _sample_commands(self) -> tuple[Floats, Floats]:
+        """Return planned positions and commands of all servos, shape (steps, servos) each."""
+        motion = sample_reference(self.trajectory, self.times)
+        fingers = sample_fingers(self.tree, self.planned, self.trajectory.times, self.times)
+        targets = np.column_stack([motion[0], fingers])
+        feedforward = compute_feedforward(self.tree, self.servos, targets, motion)
+        count = motion[1].shape[1]
+        feedforward[:, :count] += motion[1] * [servo.damping for servo in self.servos[:count]]
+        return targets, targets + feedforward / [servo.stiffness for servo in self.servos]
+
+    def _has_diverged(self, data: Any) -> bool:
+        """Return whether the integration has diverged."""
+        warnings = self.mj.mjtWarning
+        kinds = (warnings.mjWARN_BADQPOS, warnings.mjWARN_BADQVEL, warnings.mjWARN_BADQACC)
+        is_reset = any(data.warning[kind].number for kind in kinds)
+        return is_reset or not np.isfinite(data.qpos).all()
+
+    def _balance_load(self, data: Any) -> Floats:
+        """Make the robot carry from the beginning what it holds at the start.
+
+        Servos and welds give way under load, and the plan begins where they have done so. They
+        would give way once more at every continuation of an execution. A motor at rest carries its
+        load where it is: each servo's command is displaced by the deflection under the load, as
+        integral action would, and so is each weld. Since the load depends on the configuration,
+        this is repeated.
+
+        Args:
+            data: State at the start, with its welds and commands.
+
+        Returns:
+            Displacement of each servo's command, shape (servos,), [m] and [rad]: at most that of
+            full effort, and 0 for fingers.
+        """
+        displacement = np.zeros(len(self.servos))
+        if not self.grips.has_active:
+            return displacement
+        mj, model, count = self.mj, self.physical.model, len(self.servos)
+        driven = self.physical.columns[:count]
+        largest = np.array([servo.limit / servo.stiffness for servo in self.servos])
+        largest[self.trajectory.robot_size :] = 0.0
+        start, commands = data.qpos[driven].copy(), data.ctrl[:count].copy()
+        for _ in range(_BALANCE_ROUNDS):
+            settled = mj.MjData(model)
+            mj.mj_copyData(settled, model, data)
+            settled.ctrl[:count] = commands + displacement
+            mj.mj_step(model, settled, nstep=round(_BALANCE_TIME / self.physics.timestep))
+            if self._has_diverged(settled):
+                return displacement  # the execution diverges as well, and says so
+            mj.mj_kinematics(model, settled)
+            self.grips.preload(data, settled)
+            deflection = start - settled.qpos[driven]
+            displacement = np.clip(displacement + deflection, -largest, largest)
+            if np.abs(deflection).max() < _BALANCED:
+                break
+        return displacement
 
     def _record_contacts(self, data: Any, labels: Any, clock: float) -> None:
         """Record the deepest penetration of each pair of links that touch."""

@@ -19,7 +19,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.simulation.model import Builder, PhysicalWorld, to_mujoco_quaternion
 from vkc_pin.simulation.physics import Physics, import_mujoco
 from vkc_pin.simulation.servos import Servo, make_servo
-from vkc_pin.simulation.welds import Grip
+from vkc_pin.simulation.welds import Grip, compute_planned_freedoms, measure_hand
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.world.models.gripper import check_bar_fits, find_widest_bar
 from vkc_pin.world.models.shapes import triangulate
@@ -226,6 +226,7 @@ class _Squeeze:
     """One grasp by friction.
 
     Attributes:
+        hold: The hold.
         begin, end: Begin and end of the hold [s].
         hand, link: Masks of the geoms of hand and grasped link, shape (geoms,).
         pairs: Pairs of their labels, which may touch.
@@ -235,6 +236,7 @@ class _Squeeze:
         missing: Number of consecutive samples without contact.
     """
 
+    hold: Hold
     begin: float
     end: float
     hand: Bools
@@ -259,7 +261,7 @@ class Squeezes:
         period: float,
     ) -> None:
         self._physical, self._fingers = physical, fingers
-        self._physics, self._period = physics, period
+        self._physics, self._period, self._trajectory = physics, period, trajectory
         self._engine = import_mujoco()
         first, last = float(trajectory.times[0]), float(trajectory.times[-1])
         world, scene = physical.world, physical.world.scene
@@ -271,7 +273,7 @@ class Squeezes:
             pairs = frozenset((min(hand, link), max(hand, link)) for hand in hands)
             own, held = np.isin(labels, list(hands)), np.asarray(labels == link)
             grip = Grip(str(hold), max(begin, first), min(end, last))
-            self._squeezes.append(_Squeeze(begin, end, own, held, pairs, grip))
+            self._squeezes.append(_Squeeze(hold, begin, end, own, held, pairs, grip))
         tree = world.model
         self._tool = tree.frames[tree.getFrameId(scene.robot.tool_frame)]
 
@@ -311,10 +313,13 @@ class Squeezes:
         """Record the load and slip of each grasp."""
         for squeeze in self._squeezes:
             begin = max(squeeze.begin + self._physics.grip_time, squeeze.grip.begin)
-            if not begin <= clock < squeeze.end or squeeze.grip.broken is not None:
+            is_over = squeeze.grip.broken is not None or squeeze.grip.missed
+            if is_over or not begin <= clock < squeeze.end:
                 continue
             tool, place = self._find_tool(data, squeeze)
-            squeeze.place = place if squeeze.place is None else squeeze.place
+            if squeeze.place is None:
+                squeeze.place = place
+                self._measure_hand(data, squeeze, clock)
             pull = self._compute_wrench(data, squeeze, tool)
             squeeze.missing = 0 if pull is not None else squeeze.missing + 1
             squeeze.forces.append(np.zeros(6) if pull is None else pull)
@@ -325,6 +330,13 @@ class Squeezes:
             slip = max(grip.slip, float(np.linalg.norm(place - squeeze.place)))
             lost_time = clock if squeeze.missing * self._period >= _LOST_TIME else None
             squeeze.grip = replace(grip, force=force, torque=torque, slip=slip, broken=lost_time)
+
+    def _measure_hand(self, data: Any, squeeze: _Squeeze, clock: float) -> None:
+        """Record where the closed hand is at the attachment."""
+        scene = self._physical.world.scene
+        planned = compute_planned_freedoms(scene, self._trajectory, squeeze.hold, clock)
+        _, distance, angle = measure_hand(self._physical, data, squeeze.hold, planned)
+        squeeze.grip = replace(squeeze.grip, distance=distance, angle=angle)
 
     def _find_tool(self, data: Any, squeeze: _Squeeze) -> tuple[Floats, Floats]:
         """Return the tool's position in the world and in the grasped body's frame [m]."""

@@ -1,9 +1,9 @@
-"""Defines SimulationResult, the outcome of an executed motion, and measures its goal errors."""
+"""Defines SimulationResult, the outcome of an executed motion."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import pinocchio as pin
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
 from vkc_pin.simulation.contacts import Contact
+from vkc_pin.simulation.goals import Miss
 from vkc_pin.simulation.physics import Physics
 from vkc_pin.simulation.replay import write_page
 from vkc_pin.simulation.servos import Servo
@@ -21,157 +22,21 @@ from vkc_pin.simulation.snapshots import write_snapshots, write_video
 from vkc_pin.simulation.welds import Grip
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.writing import write_atomically
-from vkc_pin.world.models.coordinates import wrap_angle
 from vkc_pin.world.scene.hold import Hold, get_attachment, measure_grasp
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actions import compile_each_step
-from vkc_pin.world.task.steps import (
-    Actuate,
-    GoTo,
-    Grasp,
-    Place,
-    Reach,
-    Release,
-    Step,
-    Touch,
-    step_to_dict,
-)
+from vkc_pin.world.task.steps import Step, step_to_dict
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World, make_scene_at
 
-__all__ = ["Miss", "SimulationResult", "Tracking", "measure_goal_errors"]
+__all__ = ["SimulationResult", "Tracking"]
 
-_TOLERANCE = 2e-3  # [m] or [rad] within which a plan counts as having completed a step
 GOAL = {"m": 0.01, "rad": 0.02}
 """Tolerances within which a goal counts as reached."""
 DEPTH = 1e-3
 """Penetration depth up to which an unplanned contact is harmless [m]."""
 _LISTED_CONTACTS = 8  # contacts in a report
 _LISTED_MOTORS = 4  # motors in a report, by decreasing load
-
-
-@dataclass(frozen=True)
-class Miss:
-    """Distance of a subject from the goal of a step.
-
-    Attributes:
-        step: Number of the step, from 1.
-        subject: Coordinate, frame or object.
-        amount: Distance from the goal, in `unit`.
-        unit: "m" or "rad".
-        time: Time of the measurement [s].
-    """
-
-    step: int
-    subject: str
-    amount: float
-    unit: str
-    time: float
-
-    def __str__(self) -> str:
-        amount = f"{1e3 * self.amount:.1f} mm" if self.unit == "m" else f"{self.amount:.4f} rad"
-        return f"step {self.step}: {self.subject} misses its goal by {amount} at {self.time:.2f} s"
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the miss as plain data."""
-        return asdict(self)
-
-
-def measure_goal_errors(
-    scene: Scene,
-    steps: Sequence[Step],
-    trajectory: Trajectory,
-    world: World,
-    times: Floats,
-    rows: Floats,
-) -> tuple[Miss, ...]:
-    """Return the error of every goal.
-
-    Each step is measured when the plan completes it for the first time, in order; the last step is
-    measured at the end.
-    """
-    planned = World(scene)
-    edges = [0, *(phase.last for phase in trajectory.phases)]
-    ends = planned.compute_positions(trajectory, trajectory.times[edges])
-    start, errors, last = 0, list[Miss](), len(ends) - 1
-
-    def is_completed(step: Step, k: int) -> bool:
-        if isinstance(step, Grasp | Release):
-            held = trajectory.phases[k].held
-            return (
-                (step.object in held) == isinstance(step, Grasp)
-                if step.object is not None
-                else not held
-            )
-        return all(
-            amount <= _TOLERANCE
-            for _, amount, _ in _compute_errors(planned, step, ends[k], ends[k])
-        )
-
-    for number, step in enumerate(steps):
-        completed = (k for k in range(start, last) if is_completed(step, k))
-        start = last if number == len(steps) - 1 else next(completed, last)
-        at = float(trajectory.times[edges[start]])
-        row = len(times) - 1 if start == last else int(np.argmin(np.abs(times - at)))
-        for subject, amount, unit in _compute_errors(world, step, rows[row], ends[start]):
-            errors.append(Miss(number + 1, subject, amount, unit, float(times[row])))
-    return tuple(errors)
-
-
-def _compute_errors(
-    world: World, step: Step, row: Floats, planned: Floats
-) -> Iterator[tuple[str, float, str]]:
-    """Yield the error of each subject of a step at configuration `row`."""
-    names, units = world.coordinates.names, world.coordinates.units
-    if isinstance(step, Actuate):
-        for joint, goal in step.joints.items():
-            column = names.index(f"{step.object}.{joint}")
-            yield names[column], abs(float(row[column]) - goal), units[column]
-    elif isinstance(step, GoTo):
-        yield "base", float(np.hypot(row[0] - step.x, row[1] - step.y)), "m"
-        if step.yaw is not None:
-            yield "base heading", float(abs(wrap_angle(row[2] - step.yaw))), "rad"
-    elif isinstance(step, Grasp):
-        scene = world.scene
-        link = f"{step.object}.{scene.objects[step.object].object.attachment(step.attachment).link}"
-        hand = step.by or scene.robot.tool_frame
-        one, other = (
-            _compute_placement(world, at, link).actInv(_compute_placement(world, at, hand))
-            for at in (row, planned)
-        )
-        offset = float(np.linalg.norm(one.translation - other.translation))
-        yield f"grasp of {step.object}", offset, "m"
-    elif isinstance(step, Reach | Touch | Place):
-        yield from _compute_pose_errors(world, step, row)
-
-
-def _compute_pose_errors(
-    world: World, step: Reach | Touch | Place, row: Floats
-) -> Iterator[tuple[str, float, str]]:
-    """Yield the position and orientation errors of a step with a pose goal."""
-    robot = world.scene.robot
-    if isinstance(step, Place):
-        frame = f"{step.object}.{world.scene.objects[step.object].object.base_link}"
-    else:
-        frame = step.frame or robot.tool_frame
-    goal: Any = step.target if isinstance(step, Touch) else step.pose
-    placement, has_pose = _compute_placement(world, row, frame), isinstance(goal, pin.SE3)
-    position = goal.translation if has_pose else np.asarray(goal)
-    yield frame, float(np.linalg.norm(placement.translation - position)), "m"
-    if has_pose:
-        yield frame, float(np.linalg.norm(pin.log3(goal.rotation.T @ placement.rotation))), "rad"
-    elif isinstance(step, Place):  # any heading, the same tilt as at the start
-        is_held = step.object in world.scene.held
-        at_start = world.scene.objects[step.object].placement.rotation[2]
-        vertical = np.array([0.0, 0.0, 1.0]) if is_held else at_start
-        yield frame, float(np.arccos(np.clip(placement.rotation[2] @ vertical, -1.0, 1.0))), "rad"
-
-
-def _compute_placement(world: World, row: Floats, frame: str) -> pin.SE3:
-    """Return the placement of a frame at configuration `row`."""
-    data = world.model.createData()
-    pin.forwardKinematics(world.model, data, world.coordinates.q(row))
-    return pin.updateFramePlacement(world.model, data, world.model.getFrameId(frame)).copy()
 
 
 @dataclass(frozen=True)
@@ -265,7 +130,7 @@ class SimulationResult:
 
     @property
     def ok(self) -> bool:
-        """Whether all goals are reached, no grasp is lost, and no contact is deeper than 1 mm."""
+        """Whether all goals are reached and grasps kept, and no contact is deeper than 1 mm."""
         return self.reached and not self.problems()
 
     def end_scene(self) -> Scene:
@@ -285,7 +150,7 @@ class SimulationResult:
         world, row = World(self.scene), self.rows[-1]
         values = dict(zip(world.coordinates.names, row.tolist(), strict=True))
         scene = make_scene_at(self.scene, world, row, values)
-        lost = {grip.what: grip.broken is not None for grip in self.grips}  # the last time
+        lost = {grip.what: grip.problem is not None for grip in self.grips}  # the last time
         holds, measured = list[Hold](), dict[str, pin.SE3]()
         for hold in compile_each_step(self.scene, self.steps, Options())[-1].after:
             pushes = get_attachment(scene.objects, hold).contact == "push"
@@ -301,11 +166,7 @@ class SimulationResult:
             [] if self.diverged is None else [f"the integration diverged at {self.diverged:.2f} s"]
         )
         problems += [str(miss) for miss in self.misses if miss.amount > GOAL[miss.unit]]
-        problems += [
-            f"{grip.what} was pulled out of the hand at {grip.broken:.2f} s"
-            for grip in self.grips
-            if grip.broken is not None
-        ]
+        problems += [grip.problem for grip in self.grips if grip.problem is not None]
         return problems + [str(contact) for contact in self.contacts if contact.depth > DEPTH]
 
     def summary(self) -> str:
@@ -326,6 +187,8 @@ class SimulationResult:
             broken = (
                 "" if grip.broken is None else f", PULLED OUT OF THE HAND at {grip.broken:.2f} s"
             )
+            if grip.missed:
+                broken = ", MISSED"
             force = f"{grip.force:.0f} N and {grip.torque:.1f} N·m at most"
             slip = f", slips by {1e3 * grip.slip:.1f} mm" if grip.slip else ""
             span = f"{grip.begin:.1f} to {grip.end:.1f} s"
@@ -369,11 +232,11 @@ class SimulationResult:
     def to_html(self, path: str | Path) -> Path:
         """Write a web page with the executed motion and the plan as a ghost; return its path."""
         notes = [(str(contact), contact.time) for contact in self.contacts if contact.depth > DEPTH]
-        notes += [
-            (f"{grip.what} is pulled out of the hand", grip.broken)
-            for grip in self.grips
-            if grip.broken is not None
-        ]
+        for grip in self.grips:
+            if grip.missed:
+                notes.append((f"the hand misses {grip.what}", grip.begin))
+            elif grip.broken is not None:
+                notes.append((f"{grip.what} is pulled out of the hand", grip.broken))
         return write_page(
             self,
             path,

@@ -1,4 +1,7 @@
-"""Models grasps as welds that follow the plan's holds and break under load, and models latches."""
+"""Models grasps as welds that follow the plan's holds and break under load, and models latches.
+
+A hand that closes beside the attachment, farther off than a measured grasp may be, holds nothing.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +11,30 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 
 from vkc_pin.simulation.contacts import Pairs
-from vkc_pin.simulation.model import PhysicalWorld
+from vkc_pin.simulation.model import PhysicalWorld, to_mujoco_quaternion
 from vkc_pin.simulation.physics import Physics, import_mujoco
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.scene.hold import Hold
+from vkc_pin.world.scene.hold import (
+    Hold,
+    compute_distances,
+    is_within_grasp,
+    measure_deviation,
+)
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["Grip", "Grips", "Latches", "find_hold_spans", "find_latches"]
+__all__ = [
+    "Grip",
+    "Grips",
+    "Latches",
+    "compute_planned_freedoms",
+    "find_hold_spans",
+    "find_latches",
+    "measure_hand",
+]
 
 _AVERAGING_TIME = 0.02  # [s] of the moving average of forces: rubber yields, a weld does not
 _LATCH_TOLERANCE = 2e-3  # [rad] or [m] from the latched position within which a latch engages
@@ -33,6 +50,8 @@ class Grip:
         force, torque: Largest 20 ms average at the grasping frame [N], [N·m].
         broken: Time at which the hand lost its hold [s]; None if it did not.
         slip: Largest displacement between holder and object, for grasps by friction [m].
+        distance, angle: Distance [m] and angle [rad] of the hand from the attachment when it
+            closes.
     """
 
     what: str
@@ -42,10 +61,27 @@ class Grip:
     torque: float = 0.0
     broken: float | None = None
     slip: float = 0.0
+    distance: float = 0.0
+    angle: float = 0.0
+
+    @property
+    def missed(self) -> bool:
+        """Whether the hand closes more than 20 mm or 0.2 rad from the attachment."""
+        return not is_within_grasp(self.distance, self.angle)
+
+    @property
+    def problem(self) -> str | None:
+        """What went wrong, in a line; None: nothing."""
+        if self.missed:
+            off = f"{1e3 * self.distance:.0f} mm and {self.angle:.2f} rad"
+            return f"the hand misses {self.what} by {off} when it closes at {self.begin:.2f} s"
+        if self.broken is not None:
+            return f"{self.what} was pulled out of the hand at {self.broken:.2f} s"
+        return None
 
     def to_dict(self) -> dict[str, Any]:
         """Return the grip as plain data."""
-        return asdict(self)
+        return {**asdict(self), "missed": self.missed}
 
 
 def find_hold_spans(scene: Scene, trajectory: Trajectory) -> list[tuple[Hold, float, float]]:
@@ -62,6 +98,45 @@ def find_hold_spans(scene: Scene, trajectory: Trajectory) -> list[tuple[Hold, fl
         }
     spans += [(hold, at, np.inf) for hold, at in active_since.items()]
     return sorted(spans, key=lambda span: (span[1], str(span[0])))
+
+
+def measure_hand(
+    physical: PhysicalWorld, data: Any, hold: Hold, planned: Sequence[float] | Floats
+) -> tuple[tuple[float, ...], float, float]:
+    """Return where a holder is at the attachment that it is to hold.
+
+    Args:
+        physical: The model.
+        data: Its state, an `mujoco.MjData`.
+        hold: The hold.
+        planned: Planned values of the attachment's freedoms, [m] and [rad].
+
+    Returns:
+        Values of the freedoms, distance [m] and angle [rad] of the holder from the attachment: as
+        planned if the hand can hold the attachment there, otherwise those that bring the
+        attachment nearest to the holder.
+    """
+    scene = physical.world.scene
+    attachment = scene.objects[hold.object].object.attachment(hold.attachment)
+    holder = physical.place_frame(data, hold.frame or scene.robot.tool_frame)
+    link = physical.place_frame(data, f"{hold.object}.{attachment.link}")
+    measured = holder.actInv(link * attachment.placement)
+    values, deviation = measure_deviation(attachment, measured, tuple(planned))
+    distance, angle = compute_distances(deviation)
+    if not is_within_grasp(distance, angle):
+        values, deviation = measure_deviation(attachment, measured)
+        distance, angle = compute_distances(deviation)
+    return values, distance, angle
+
+
+def compute_planned_freedoms(
+    scene: Scene, trajectory: Trajectory, hold: Hold, clock: float
+) -> Floats:
+    """Return the planned values of a grasp's degrees of freedom at a time [s], [m] and [rad]."""
+    names = scene.objects[hold.object].object.attachment(hold.attachment).coordinates
+    values = dict(zip(trajectory.names, trajectory.at(clock).tolist(), strict=True))
+    start = dict(zip(names, hold.at, strict=False))
+    return np.array([values.get(f"{hold.object}.{name}", start.get(name, 0.0)) for name in names])
 
 
 def _is_push(scene: Scene, hold: Hold) -> bool:
@@ -93,8 +168,14 @@ class Grips:
         self.grips: list[Grip] = []
         self._active: dict[Hold, tuple[int, float]] = {}  # index into grips, and end [s]
         self._forces: dict[Hold, deque[Floats]] = {}
+        self._targets: dict[Hold, pin.SE3] = {}  # of the welds: placement of link in holder
         self._equality = int(self._engine.mjtConstraint.mjCNSTR_EQUALITY)
         self._window = max(1, round(_AVERAGING_TIME / physics.timestep))
+
+    @property
+    def has_active(self) -> bool:
+        """Whether anything is welded."""
+        return bool(self._active)
 
     def follow(self, data: Any, clock: float) -> None:
         """Begin and end the holds that are due at a time [s] of the plan."""
@@ -102,11 +183,19 @@ class Grips:
             self._release(data, hold)
         while self.schedule and self.schedule[0][1] <= clock:
             hold, begin, end = self.schedule.pop(0)
-            self._engage(data, hold, clock)
-            self._active[hold] = len(self.grips), end
-            self._forces[hold] = deque(maxlen=self._window)
             first, last = self.trajectory.times[[0, -1]].tolist()
-            self.grips.append(Grip(str(hold), max(begin, first), min(end, last)))
+            planned = compute_planned_freedoms(
+                self.physical.world.scene, self.trajectory, hold, clock
+            )
+            values, distance, angle = measure_hand(self.physical, data, hold, planned)
+            grip = Grip(
+                str(hold), max(begin, first), min(end, last), distance=distance, angle=angle
+            )
+            if not grip.missed:
+                self._engage(data, hold, values)
+                self._active[hold] = len(self.grips), end
+                self._forces[hold] = deque(maxlen=self._window)
+            self.grips.append(grip)
 
     def measure(self, data: Any, clock: float) -> None:
         """Record the load on the welds after a step, and release those that are overloaded."""
@@ -135,22 +224,50 @@ class Grips:
             if broken is not None:
                 self._release(data, hold)
 
-    def _engage(self, data: Any, hold: Hold, clock: float) -> None:
+    def preload(self, data: Any, settled: Any) -> None:
+        """Displace each weld such that its load at rest keeps the bodies where they are now.
+
+        A weld gives way under load. The relative placement G of the welded bodies becomes G' when
+        the weld has settled, while its target is T. With the target T · (G⁻¹ · G')⁻¹ the same load
+        leaves them at G, up to terms of second order.
+
+        Args:
+            data: The state that is to last, an `mujoco.MjData`.
+            settled: The state that the welds of `data` lead to.
+        """
+        for hold in self._active:
+            kept = self._measure_weld(data, hold)
+            given_way = self._measure_weld(settled, hold)
+            self._set_target(hold, self._targets[hold] * kept.actInv(given_way).inverse())
+
+    def _measure_weld(self, data: Any, hold: Hold) -> pin.SE3:
+        """Return the placement of the welded link's body in that of the holder."""
+        model, number = self.physical.model, self.holds.index(hold)
+        holder = self.physical.place_body(data, int(model.eq_obj1id[number]))
+        link = self.physical.place_body(data, int(model.eq_obj2id[number]))
+        return holder.actInv(link)
+
+    def _engage(self, data: Any, hold: Hold, freedoms: Sequence[float]) -> None:
         """Weld the holder to the link at their current relative placement."""
         model, number = self.physical.model, self.holds.index(hold)
         if hold in self.physical.carriers:
-            data.qpos[self.physical.carriers[hold]] = self._planned_freedoms(hold, clock)
+            data.qpos[self.physical.carriers[hold]] = freedoms
             self._engine.mj_kinematics(model, data)
-        first, second = int(model.eq_obj1id[number]), int(model.eq_obj2id[number])
-        tool = self._grasp_point(data, hold)
-        one, other = (np.asarray(data.xmat[body]).reshape(3, 3) for body in (first, second))
-        quaternion = np.zeros(4)
-        self._engine.mju_mat2Quat(quaternion, (one.T @ other).ravel())
-        model.eq_data[number, :3] = other.T @ (tool - data.xpos[second])
-        model.eq_data[number, 3:6] = one.T @ (tool - data.xpos[first])
-        model.eq_data[number, 6:10] = quaternion
+        scene = self.physical.world.scene
+        link = self.physical.place_body(data, int(model.eq_obj2id[number]))
+        tool = self.physical.place_frame(data, hold.frame or scene.robot.tool_frame)
+        model.eq_data[number, :3] = link.actInv(tool).translation
+        self._set_target(hold, self._measure_weld(data, hold))
         data.eq_active[number] = 1
         self._set_collision(hold, enabled=False)
+
+    def _set_target(self, hold: Hold, target: pin.SE3) -> None:
+        """Set the placement of the welded link's body in that of the holder."""
+        model, number = self.physical.model, self.holds.index(hold)
+        anchor = np.array(model.eq_data[number, :3])  # of the weld, in the link's body
+        model.eq_data[number, 3:6] = target.act(anchor)
+        model.eq_data[number, 6:10] = to_mujoco_quaternion(target)
+        self._targets[hold] = target
 
     def _release(self, data: Any, hold: Hold) -> None:
         data.eq_active[self.holds.index(hold)] = 0
@@ -167,31 +284,6 @@ class Grips:
         own = self.physical.geoms[(self.pairs.types & bit) != 0]
         types = self.physical.model.geom_contype
         types[own] = types[own] | bit if enabled else types[own] & ~bit
-
-    def _planned_freedoms(self, hold: Hold, clock: float) -> Floats:
-        """Return the planned values of a grasp's degrees of freedom."""
-        names = (
-            self.physical.world.scene.objects[hold.object]
-            .object.attachment(hold.attachment)
-            .coordinates
-        )
-        values = dict(zip(self.trajectory.names, self.trajectory.at(clock).tolist(), strict=True))
-        start = dict(zip(names, hold.at, strict=False))
-        return np.array(
-            [values.get(f"{hold.object}.{name}", start.get(name, 0.0)) for name in names]
-        )
-
-    def _grasp_point(self, data: Any, hold: Hold) -> Floats:
-        """Return the position of the holder's grasping frame in the world [m]."""
-        tree = self.physical.world.model
-        frame = tree.frames[
-            tree.getFrameId(hold.frame or self.physical.world.scene.robot.tool_frame)
-        ]
-        body = self.physical.bodies[frame.parentJoint]
-        return np.asarray(
-            data.xpos[body]
-            + np.asarray(data.xmat[body]).reshape(3, 3) @ frame.placement.translation
-        )
 
 
 def find_latches(scene: Scene) -> list[tuple[str, float, str, float]]:

@@ -13,7 +13,6 @@ from helpers.carrying import (
     MotionBuilder,
     compute_freedom,
     compute_grasp_pose,
-    describe_stand,
     describe_table,
     lift,
     make_carrying_motion,
@@ -23,6 +22,7 @@ from helpers.carrying import (
     solve_reach,
 )
 from helpers.drawers import compute_tool_pose
+from helpers.held_sticks import PULL, make_fetching_motion
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -30,7 +30,6 @@ from vkc_pin import Scene, Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
 TIP = pin.SE3(pin.utils.rotate("x", -np.pi / 2), np.array([0.0, 0.25, 0.0]))  # in the stick
-PULL = (np.pi / 2, 0.0, 0.0)  # orientation of the ball on the tip, which approaches from the right
 
 
 def compute_placements(
@@ -113,20 +112,6 @@ def test_grasp_freedoms_move_the_hand_along_the_object() -> None:
         for at, tool, held in zip(sticks, compute_tools(scene, motion, times), values, strict=True):
             grasp = compute_grasp_pose(pin.SE3.Identity(), values=held)
             assert_close(at, tool * grasp.inverse() * offset)
-
-
-def make_fetching_motion() -> tuple[Scene, MotionBuilder]:
-    """Return a motion in which a held stick lifts a ball, carries it aside and puts it down."""
-    scene = make_room(describe_stand(), objects=("stick", "ball"))
-    # The stick's tip is at the ball.
-    south = pin.SE3(STICK.rotation, BALL.translation - np.array([0.0, 0.285, 0.0]))
-    touch = solve_reach(compute_grasp_pose(south), solve_above(STICK))
-    up = solve_reach(compute_grasp_pose(lift(south, UP / 4)), touch)
-    scene = scene.with_held({"stick": "grip"}).with_start(arm=up[3:])
-    script = MotionBuilder(scene).go(touch).take("ball", "pull", PULL, by="stick.tip").go(up)
-    script.go(move_base(up, y=0.3)).go(move_base(touch, y=0.3)).let_go("ball")
-    script.go(move_base(touch, y=0.1))
-    return scene, script
 
 
 def test_object_held_through_a_stick_follows_its_tip() -> None:

@@ -36,11 +36,14 @@ __all__ = [
     "apply_deviation",
     "check_deviation",
     "check_hold_order",
+    "compute_distances",
     "compute_tool_placement",
     "find_reversed_approaches",
     "fit_grasp",
     "get_attachment",
+    "is_within_grasp",
     "make_holds",
+    "measure_deviation",
     "measure_grasp",
     "place_held_objects",
     "resolve_holds",
@@ -48,9 +51,9 @@ __all__ = [
 ]
 
 MAX_POSITION_DEVIATION = 0.02
-"""Largest distance of a measured hand from its attachment [m]."""
+"""Largest distance of a hand from the attachment that it holds [m], measured or in physics."""
 MAX_ANGLE_DEVIATION = 0.2
-"""Largest angle between a measured hand and its attachment [rad]."""
+"""Largest angle between a hand and the attachment that it holds [rad], measured or in physics."""
 _DECIMALS = 9  # of a deviation: converting it to a pose and back gives the same numbers
 _SLACK = 1e-9  # [m] or [rad] of rounding
 _MAX_STARTS = 81  # combinations of lower end, middle and upper end of the freedoms
@@ -91,6 +94,26 @@ def fit_grasp(
     Raises:
         InputError: The hand is too far from the attachment.
     """
+    values, deviation = measure_deviation(attachment, measured, values)
+    found = np.round(deviation, _DECIMALS) + 0.0  # no negative zeros
+    check_deviation(found, field)
+    return values, tuple(found.tolist()) if found.any() else ()
+
+
+def measure_deviation(
+    attachment: Attachment, measured: pin.SE3, values: Sequence[float] | None = None
+) -> tuple[tuple[float, ...], Floats]:
+    """Return the freedoms of a grasp, and how far the hand is from the attachment.
+
+    Args:
+        attachment: The attachment.
+        measured: Measured placement of its frame in the grasping frame.
+        values: Values of the freedoms, [m] and [rad]; None: those with the smallest deviation.
+
+    Returns:
+        Values of the freedoms, and x, y, z [m] and rotation vector [rad] of the grasping frame in
+        the frame that the attachment demands at these values, shape (6,).
+    """
     hand = measured.inverse()
 
     def compute_deviation(at: Sequence[float] | Floats) -> Floats:
@@ -99,15 +122,25 @@ def fit_grasp(
 
     if values is None:
         values = _fit_freedoms(attachment, compute_deviation)
-    found = np.round(compute_deviation(values), _DECIMALS) + 0.0  # no negative zeros
-    check_deviation(found, field)
-    return tuple(float(value) for value in values), tuple(found.tolist()) if found.any() else ()
+    return tuple(float(value) for value in values), compute_deviation(values)
+
+
+def compute_distances(deviation: Sequence[float] | Floats) -> tuple[float, float]:
+    """Return distance [m] and angle [rad] of a hand from its attachment; see `Hold.deviation`."""
+    position, angle = (float(np.linalg.norm(part)) for part in (deviation[:3], deviation[3:]))
+    return position, angle
+
+
+def is_within_grasp(position: float, angle: float) -> bool:
+    """Return whether a hand at a distance [m] and angle [rad] from its attachment can hold it."""
+    is_near = position <= MAX_POSITION_DEVIATION + _SLACK
+    return is_near and angle <= MAX_ANGLE_DEVIATION + _SLACK
 
 
 def check_deviation(deviation: Sequence[float] | Floats, field: str) -> None:
     """Check that a hand is near its attachment. Raises `InputError` if it is not."""
-    position, angle = (float(np.linalg.norm(part)) for part in (deviation[:3], deviation[3:]))
-    if position > MAX_POSITION_DEVIATION + _SLACK or angle > MAX_ANGLE_DEVIATION + _SLACK:
+    position, angle = compute_distances(deviation)
+    if not is_within_grasp(position, angle):
         raise InputError(
             "the hand is too far from the attachment",
             field=field,

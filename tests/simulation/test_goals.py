@@ -1,0 +1,204 @@
+"""Tests that misses are measured, and objects held, where things are in the execution."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from helpers.carrying import BALL, describe_stand
+from helpers.drawers import compute_handle_pose, replace_scene_fields
+from helpers.drives import make_scene
+from helpers.executions import plan_door, plan_drawer
+from helpers.held_sticks import make_fetching_motion
+
+import vkc_pin as vkc
+from vkc_pin.planning.plan import Plan
+from vkc_pin.simulation.execution import simulate
+from vkc_pin.world.scene.hold import MAX_ANGLE_DEVIATION, MAX_POSITION_DEVIATION
+from vkc_pin.world.scene.scene import Scene
+
+GOAL = (-0.6, -1.6, 0.751)  # of the cup, on the table [m]
+
+
+def displace(
+    scene: Scene, name: str, shift: tuple[float, ...] = (0.0, 0.0, 0.0), *, turn: float = 0.0
+) -> Scene:
+    """Return the scene with an object moved by `shift` [m], and turned about the drawer's grasp."""
+    pivot = pin.SE3(np.eye(3), compute_handle_pose().translation)
+    turned = pivot * pin.SE3(pin.utils.rotate("z", turn), np.zeros(3)) * pivot.inverse()
+    moved = pin.SE3(np.eye(3), np.array(shift)) * turned * scene.objects[name].placement
+    return scene.with_placement(name, moved)
+
+
+@cache
+def plan_drawer_grasp(attachment: str) -> Plan:
+    return vkc.plan(vkc.load_scene("drawer"), [vkc.Grasp("drawer", attachment)])
+
+
+@cache
+def plan_cup() -> Plan:
+    """Return a plan that puts the cup on the table and drives on."""
+    steps = [vkc.Grasp("cup"), vkc.Place("cup", GOAL), vkc.GoTo(0.0, 0.0)]
+    plan = vkc.plan(vkc.load_scene("household"), steps)
+    assert plan.success
+    return plan
+
+
+@pytest.mark.parametrize(
+    "shift", [(0.6, 0.0, 0.0), (0.12, 0.0, 0.0), (0.0, 0.3, 0.0), (0.0, 0.0, 0.25)]
+)
+def test_hand_that_closes_beside_the_handle_holds_nothing(shift: tuple[float, ...]) -> None:
+    plan = plan_drawer()
+    result = plan.simulate(actual=displace(plan.scene, "drawer", shift))
+    (grip,) = result.grips
+    assert not result.ok
+    assert grip.missed
+    assert grip.force == 0.0
+    assert grip.distance == pytest.approx(np.linalg.norm(shift), abs=2e-3)
+    # The drawer stays closed, 0.3 m from the goal.
+    assert np.abs(result.trajectory.column("drawer.slide")).max() < 1e-3
+    assert result.misses[0].amount == pytest.approx(0.3, abs=1e-3)
+    assert f"the hand misses drawer.handle by {1e3 * grip.distance:.0f} mm" in result.summary()
+
+
+@pytest.mark.parametrize(
+    ("shift", "turn", "held"),
+    [
+        (MAX_POSITION_DEVIATION - 2e-3, 0.0, True),
+        (MAX_POSITION_DEVIATION + 2e-3, 0.0, False),
+        (0.0, MAX_ANGLE_DEVIATION - 0.05, True),
+        (0.0, MAX_ANGLE_DEVIATION + 0.05, False),
+    ],
+)
+def test_bound_of_grasps_is_that_of_measured_grasps(shift: float, turn: float, held: bool) -> None:
+    plan = plan_drawer()
+    actual = displace(plan.scene, "drawer", (0.0, shift, 0.0), turn=turn)
+    result = plan.simulate(actual=actual)
+    assert result.grips[0].missed is not held
+    moved = np.abs(result.trajectory.column("drawer.slide")).max()
+    assert (float(moved) > 0.1) is held
+
+
+@pytest.mark.parametrize("attachment", ["handle", pytest.param("push", marks=pytest.mark.long)])
+@pytest.mark.parametrize("shift", [(0.6, 0.0, 0.0), (0.0, 0.0, 0.25), (0.015, 0.0, 0.0)])
+def test_grasp_misses_an_object_that_stands_elsewhere(
+    attachment: str, shift: tuple[float, ...]
+) -> None:
+    plan = plan_drawer_grasp(attachment)
+    result = plan.simulate(actual=displace(plan.scene, "drawer", shift))
+    assert not result.ok
+    # A pushing hand may touch elsewhere on the face, by 50 mm in height.
+    least = 0.2 if attachment == "push" and shift[2] else np.linalg.norm(shift)
+    assert result.misses[0].amount == pytest.approx(least, abs=2e-3)
+    assert plan.simulate().misses[0].amount < 1e-3
+
+
+def test_grasp_misses_a_turned_object() -> None:
+    plan = plan_drawer_grasp("handle")
+    result = plan.simulate(actual=displace(plan.scene, "drawer", turn=0.1))
+    (position, angle) = result.misses
+    assert (position.unit, angle.unit) == ("m", "rad")
+    assert position.amount < 2e-3
+    assert angle.amount == pytest.approx(0.1, abs=2e-3)
+    assert not result.ok
+
+
+def test_freedom_of_a_grasp_is_no_miss() -> None:
+    """A handle that turns about its bar is held at any angle within the freedom."""
+    plan = plan_drawer_grasp("handle_free")
+    scene = plan.scene
+    bar = pin.SE3(np.eye(3), compute_handle_pose().translation)
+    tilted = bar * pin.SE3(pin.utils.rotate("y", 0.1), np.zeros(3)) * bar.inverse()
+    result = plan.simulate(
+        actual=scene.with_placement("drawer", tilted * scene.objects["drawer"].placement)
+    )
+    assert result.ok, result.summary()
+    fixed = plan_drawer_grasp("handle")
+    result = fixed.simulate(
+        actual=scene.with_placement("drawer", tilted * scene.objects["drawer"].placement)
+    )
+    assert result.misses[1].amount == pytest.approx(0.1, abs=2e-3)
+
+
+def test_fingers_close_beside_the_handle() -> None:
+    plan = plan_drawer()
+    result = plan.simulate(grasp="friction", actual=displace(plan.scene, "drawer", (0.6, 0.0, 0.0)))
+    (grip,) = result.grips
+    assert not result.ok
+    assert grip.distance == pytest.approx(0.6, abs=2e-3)
+    assert any("the hand misses drawer.handle by 600 mm" in line for line in result.problems())
+    nearly = displace(plan.scene, "drawer", (0.0, 0.006, 0.0))
+    assert plan.simulate(grasp="friction", actual=nearly).ok
+
+
+def test_lever_that_is_missed_keeps_the_door_latched() -> None:
+    plan = plan_door()
+    result = plan.simulate(actual=displace(plan.scene, "door", (0.0, 0.0, 0.1)))
+    assert not result.ok
+    assert any("the hand misses door.handle by 100 mm" in line for line in result.problems())
+
+
+def test_free_object_is_missed_where_it_really_is() -> None:
+    plan = plan_cup()
+    start = plan.scene.objects["cup"].placement.translation
+    shift = (0.5, 1.5, -0.45)  # on the floor
+    result = plan.simulate(actual=displace(plan.scene, "cup", shift))
+    assert not result.ok
+    grasp, _, place, *_ = result.misses
+    assert grasp.subject == "grasp of cup"
+    assert grasp.amount == pytest.approx(np.linalg.norm(shift), abs=0.03)
+    # The cup still stands where it was.
+    there = start + np.array(shift)
+    assert place.amount == pytest.approx(np.linalg.norm(there - GOAL), abs=0.05)
+
+
+def lower(scene: Scene, name: str, depth: float) -> Scene:
+    """Return the scene with a table sunk into the floor by `depth` [m]."""
+    obstacles = [dict(entry) for entry in scene.document["obstacles"]]
+    (table,) = (entry for entry in obstacles if entry["name"] == name)
+    x, y, z = table["position"]
+    table["position"] = [x, y, z - depth]
+    return replace_scene_fields(scene, obstacles=obstacles)
+
+
+def test_object_that_falls_after_its_release_misses_its_place() -> None:
+    """The robot drives on, and the cup falls by 0.2 m."""
+    plan = plan_cup()
+    assert plan.simulate().ok
+    result = plan.simulate(actual=lower(plan.scene, "dining_table", 0.2))
+    (miss,) = (m for m in result.misses if m.subject == "cup.cup" and m.unit == "m")
+    assert miss.amount > 0.19
+    assert not result.ok
+
+
+@pytest.mark.long
+def test_release_misses_what_does_not_stay() -> None:
+    plan = vkc.plan(vkc.load_scene("household"), [vkc.Grasp("cup")])
+    held = plan.end_scene()
+    x, y, _ = held.start[:3].tolist()
+    plan = vkc.plan(held, [vkc.Release("cup"), vkc.GoTo(x, y - 0.3)])
+    assert plan.success, plan.summary()
+    assert plan.simulate().ok
+    result = plan.simulate(actual=lower(held, "coffee_table", 0.2))
+    assert result.misses[0].subject == "cup"
+    assert result.misses[0].amount > 0.19
+    assert not result.ok
+
+
+@pytest.mark.parametrize(("aside", "missed"), [(0.01, False), (0.1, True)])
+def test_tool_holds_only_what_it_touches(aside: float, missed: bool) -> None:
+    """A stick's tip is to fetch a ball, which stands aside."""
+    scene, script = make_fetching_motion()
+    steps = [vkc.Grasp("ball", "pull", by="stick.tip"), vkc.Release("ball")]
+    document = {**scene.document, "obstacles": [describe_stand(aside=aside)]}
+    shift = pin.SE3(np.eye(3), np.array([0.0, aside, 0.0]))
+    actual = make_scene(document).with_start(arm=scene.start[3:]).with_held(scene.holds)
+    actual = actual.with_placement("ball", shift * BALL)
+    result = simulate(scene, steps, script.motion(), actual=actual)
+    (grip,) = (grip for grip in result.grips if grip.what.startswith("ball."))
+    assert grip.missed is missed
+    assert grip.distance == pytest.approx(aside, abs=5e-3)
+    assert grip.problem is None or "misses ball.pull by stick.tip" in grip.problem
+    assert (result.misses[0].amount > 0.05) is missed

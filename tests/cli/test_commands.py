@@ -14,7 +14,6 @@ from helpers.executions import plan_drawer
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks import door
-from vkc_pin.cli import commands
 from vkc_pin.world.files.resources import find_resource_folder
 
 TIMED_OUT = (
@@ -119,6 +118,13 @@ def test_failed_plan_is_written_and_returns_1(run: RunCommand) -> None:
         ("plan door --set door.hinge=nan", ["not finite"]),
         ("plan door", ["--set", "--reach", "--go-to"]),
         ("plan door --reach 1 0 0 0 up 0", ["--reach", "'up'"]),
+        ("plan door --then", ["nothing to plan", "--set", "--place"]),
+        ("plan door --grasp cup.", ["--grasp", "OBJECT.ATTACHMENT", "'cup.'"]),
+        ("plan door --grasp dor", ["there is no object 'dor'", "did you mean 'door'"]),
+        ("plan door --place door 1 2", ["--place", "OBJECT X Y Z", "2 numbers after 'door'"]),
+        ("plan door --place door 1 2 high", ["--place", "not a number", "'high'"]),
+        ("plan door --touch tool 1 2 high", ["--touch", "FRAME X Y Z", "'high'"]),
+        ("plan door --release dor", ["there is no object 'dor'", "did you mean 'door'"]),
         ("plan door --set door.hinge=1 --initialization stationry", ["did you mean 'stationary'"]),
         ("plan door --set door.hinge=1 --time-limit -1", ["time_limit", "more than 0"]),
         ("plan door --st x", ["usage: vkc-pin plan ", "--st x"]),
@@ -226,16 +232,6 @@ def test_exit_code_distinguishes_infeasible_from_failed(run: RunCommand) -> None
     result = run("plan drawer --set drawer.slide=0.3 --max-evaluations 500 --quiet")
     assert result.code == 1
     assert result.out.startswith("drawer: FAILED, evaluation limit")
-
-
-def test_consecutive_settings_of_an_object_become_one_step() -> None:
-    settings = ["door.knob=0.5", "door.hinge=1.2", "drawer.slide=0.3", "door.hinge=0"]
-    assert commands.parse_settings([*settings, "door.hinge = 1"]) == [
-        vkc.Actuate("door", {"knob": 0.5, "hinge": 1.2}),
-        vkc.Actuate("drawer", {"slide": 0.3}),
-        vkc.Actuate("door", {"hinge": 0.0}),
-        vkc.Actuate("door", {"hinge": 1.0}),
-    ]
 
 
 def test_srdf_is_written(run: RunCommand) -> None:

@@ -5,9 +5,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import functools
-import itertools
 import json
-import operator
 import platform
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -32,12 +30,13 @@ from vkc_pin.cli.options import (
     add_seed,
     parse_positive,
 )
+from vkc_pin.cli.steps import add_steps, make_steps
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.world.files.writing import check_outputs, write_atomically
 from vkc_pin.world.trajectory.formats.rosbag import import_rosbags
 from vkc_pin.world.trajectory.formats.tables import GROUPS
 
-__all__ = ["EXIT_MISUSE", "make_parser", "parse_settings", "run"]
+__all__ = ["EXIT_MISUSE", "make_parser", "run"]
 
 # Exit codes by the status of a plan; others mean failure
 _STATUS_CODES = {"infeasible": EXIT_INFEASIBLE, "interrupted": EXIT_INTERRUPTED}
@@ -59,74 +58,7 @@ _EXPORTS = {
     "--ros FILE": "write JSON with the fields of trajectory_msgs/JointTrajectory",
     "--rosbag FOLDER": "write a recording of ROS 2 (rosbag2); needs the extra `ros`",
 }
-_STEPS: tuple[tuple[str, str, dict[str, Any]], ...] = (
-    ("--set OBJECT.JOINT=VALUE", "bring a joint to a value [m], [rad]; may be repeated", {}),
-    (
-        "--reach",
-        "bring the hand to a pose [m], [rad]; may be repeated",
-        {"nargs": 6, "type": float, "metavar": ("X", "Y", "Z", "ROLL", "PITCH", "YAW")},
-    ),
-    (
-        "--go-to",
-        "drive the base to a place [m], [rad]; may be repeated",
-        {"nargs": 3, "type": float, "metavar": ("X", "Y", "YAW")},
-    ),
-)
 Writers = Mapping[str, Callable[[str], object]]
-
-
-def parse_settings(settings: Sequence[str]) -> list[Any]:
-    """Return `Actuate` steps of texts "object.joint=value".
-
-    Consecutive settings of different joints of one object become one step.
-
-    Raises:
-        InputError: A text has another form.
-    """
-    from vkc_pin.world.task.steps import Actuate
-
-    grouped: list[tuple[str, dict[str, float]]] = []
-    for text in settings:
-        name, equals, value = text.partition("=")
-        owner, dot, joint = name.strip().partition(".")
-        expected = "OBJECT.JOINT=VALUE, e.g. door.hinge=1.2"
-        if not (equals and dot and owner and joint):
-            raise InputError("not a setting", field="--set", expected=expected, got=repr(text))
-        try:
-            number = float(value)
-        except ValueError:
-            raise InputError(
-                "not a number after '='", field="--set", expected=expected, got=repr(text)
-            ) from None
-        if grouped and grouped[-1][0] == owner and joint not in grouped[-1][1]:
-            grouped[-1][1][joint] = number
-        else:
-            grouped.append((owner, {joint: number}))
-    return [Actuate(owner, joints) for owner, joints in grouped]
-
-
-class _AppendStep(argparse.Action):
-    """Appends option and value to `steps`, which keeps the order of different options."""
-
-    def __call__(self, parser: Any, namespace: Any, values: Any, option: str | None = None) -> None:
-        namespace.steps = [*(namespace.steps or ()), (self.const, values)]
-
-
-def _make_steps(given: Sequence[tuple[str, Any]]) -> list[Any]:
-    """Return the steps of options and their values, in this order."""
-    from vkc_pin.world.task.steps import GoTo, Reach
-
-    steps = list[Any]()
-    for option, values in itertools.groupby(given, key=operator.itemgetter(0)):
-        if option == "--set":
-            steps += parse_settings([value for _, value in values])
-        else:
-            make = GoTo if option == "--go-to" else lambda *pose: Reach(pose)
-            steps += [make(*value) for _, value in values]
-    if not steps:
-        expected = "--set OBJECT.JOINT=VALUE, --reach X Y Z ROLL PITCH YAW or --go-to X Y YAW"
-        raise InputError("nothing to plan", field="plan", expected=expected)
-    return steps
 
 
 def _print_progress(row: Any) -> None:
@@ -141,7 +73,7 @@ def _plan(arguments: argparse.Namespace) -> int:
     import vkc_pin as vkc
     from vkc_pin.visualization.plots.plots import PICTURES
 
-    steps = _make_steps(arguments.steps or ())
+    steps = make_steps(arguments.steps or ())
     files = _get_given(arguments, "save", "json", "csv", "ros", "html", "rosbag", "plots")
     outputs: dict[str, str] = dict(files)
     if (folder := files.get("plots")) is not None:
@@ -383,14 +315,12 @@ def _add_srdf(commands: Any) -> None:
 
 def _add_plan(commands: Any) -> None:
     about = (
-        "Plan a motion of the steps --set, --reach and --go-to, in this order. It brings joints of "
-        "objects to values, the hand to poses and the base to places."
+        "Plan a motion of steps, in the order in which they are given: they bring joints of "
+        "objects to values, objects and the hand to poses, and the base to places."
     )
     plan = add_command(commands, "plan", "plan a motion", _plan, about)
     add_option(plan, "scene SCENE", "name of an included scene, or a YAML file")
-    for form, text, settings in _STEPS:
-        option = form.partition(" ")[0]
-        add_option(plan, form, text, action=_AppendStep, dest="steps", const=option, **settings)
+    add_steps(plan)
     for form, text in (_OUTPUTS | _EXPORTS).items():
         add_option(plan, form, text)
     methods = "auto, interpolated, astar, rrt or stationary"

@@ -1,0 +1,175 @@
+"""Defines the options of `vkc-pin plan` that are steps, in the order in which they are given."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from vkc_pin.cli.options import add_option
+from vkc_pin.errors import InputError
+
+if TYPE_CHECKING:
+    from vkc_pin.world.task.steps import Step
+
+__all__ = ["add_steps", "make_steps", "parse_settings"]
+
+_SETTING = "OBJECT.JOINT=VALUE, e.g. door.hinge=1.2"
+_THEN = "--then"
+_OPTIONS: tuple[tuple[str, str, dict[str, Any]], ...] = (
+    ("--set OBJECT.JOINT=VALUE", "bring a joint to a value [m], [rad]", {}),
+    ("--grasp OBJECT[.ATTACHMENT]", "grasp an object", {}),
+    (
+        "--touch",
+        "bring a link of a held object, or of the robot, to a point [m]",
+        {"nargs": 4, "metavar": ("FRAME", "X", "Y", "Z")},
+    ),
+    (
+        "--place",
+        "put an object down upright at a point [m], or at a pose (with ROLL PITCH YAW [rad])",
+        {"nargs": "+", "metavar": ("OBJECT", "NUMBER")},
+    ),
+    ("--release OBJECT", "release an object", {}),
+    (
+        "--reach",
+        "bring the hand to a pose [m], [rad]",
+        {"nargs": 6, "type": float, "metavar": ("X", "Y", "Z", "ROLL", "PITCH", "YAW")},
+    ),
+    (
+        "--go-to",
+        "drive the base to a place [m], [rad]",
+        {"nargs": 3, "type": float, "metavar": ("X", "Y", "YAW")},
+    ),
+    (_THEN, "begin a new step: settings of one object before and after it are two steps", {}),
+)
+
+
+def add_steps(plan: argparse.ArgumentParser) -> None:
+    """Add the options to a parser; each may be repeated."""
+    group = plan.add_argument_group("steps, in their order; each may be repeated")
+    for form, text, settings in _OPTIONS:
+        option = form.partition(" ")[0]
+        nargs = {"nargs": 0} if option == _THEN else {}
+        common = {"action": _AppendStep, "dest": "steps", "const": option}
+        add_option(group, form, text, **common, **nargs, **settings)
+
+
+class _AppendStep(argparse.Action):
+    """Appends option and value to `steps`, which keeps the order of different options."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option: str | None = None) -> None:
+        namespace.steps = [*(namespace.steps or ()), (self.const, values)]
+
+
+def make_steps(given: Sequence[tuple[str, Any]]) -> list[Step]:
+    """Return the steps of options and their values, in this order.
+
+    Consecutive settings of different joints of one object become one step; `--then` separates them.
+
+    Raises:
+        InputError: There are none, or a value has another form.
+    """
+    steps = list[Any]()
+    settings = list[str]()
+    for option, values in given:
+        if option == "--set":
+            settings.append(values)
+            continue
+        steps += parse_settings(settings)
+        settings = []
+        if option != _THEN:
+            steps.append(_MAKERS[option](values))
+    steps += parse_settings(settings)
+    if not steps:
+        expected = ", ".join(form.partition(" ")[0] for form, _, _ in _OPTIONS[:-1])
+        raise InputError("nothing to plan", field="plan", expected=f"one of {expected}")
+    return steps
+
+
+def parse_settings(settings: Sequence[str]) -> list[Step]:
+    """Return `Actuate` steps of texts "object.joint=value".
+
+    Consecutive settings of different joints of one object become one step.
+
+    Raises:
+        InputError: A text has another form.
+    """
+    from vkc_pin.world.task.steps import Actuate
+
+    grouped: list[tuple[str, dict[str, float]]] = []
+    for text in settings:
+        name, equals, value = text.partition("=")
+        owner, dot, joint = name.strip().partition(".")
+        if not (equals and dot and owner and joint):
+            raise InputError("not a setting", field="--set", expected=_SETTING, got=repr(text))
+        number = _parse_number(value, "--set", _SETTING, text)
+        if grouped and grouped[-1][0] == owner and joint not in grouped[-1][1]:
+            grouped[-1][1][joint] = number
+        else:
+            grouped.append((owner, {joint: number}))
+    return [Actuate(owner, joints) for owner, joints in grouped]
+
+
+def _parse_number(text: str, field: str, expected: str, whole: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        problem = "not a number after '='" if field == "--set" else "not a number"
+        raise InputError(problem, field=field, expected=expected, got=repr(whole)) from None
+
+
+def _make_grasp(value: str) -> Step:
+    from vkc_pin.world.task.steps import Grasp
+
+    name, dot, attachment = value.partition(".")
+    if not name or (dot and not attachment):
+        expected = "OBJECT or OBJECT.ATTACHMENT, e.g. cup.rim"
+        raise InputError("not a grasp", field="--grasp", expected=expected, got=repr(value))
+    return Grasp(name, attachment or None)
+
+
+def _make_touch(values: Sequence[str]) -> Step:
+    from vkc_pin.world.task.steps import Touch
+
+    frame, *point = values
+    expected = "FRAME X Y Z, e.g. stick.tip 1.2 0.3 0.8"
+    return Touch(frame, [_parse_number(one, "--touch", expected, one) for one in point])
+
+
+def _make_place(values: Sequence[str]) -> Step:
+    from vkc_pin.world.task.steps import Place
+
+    name, *numbers = values
+    expected = "OBJECT X Y Z, or OBJECT X Y Z ROLL PITCH YAW"
+    if len(numbers) not in (3, 6):
+        got = f"{len(numbers)} numbers after {name!r}"
+        raise InputError("not a place", field="--place", expected=expected, got=got)
+    return Place(name, [_parse_number(one, "--place", expected, one) for one in numbers])
+
+
+def _make_release(value: str) -> Step:
+    from vkc_pin.world.task.steps import Release
+
+    return Release(value)
+
+
+def _make_reach(pose: Sequence[float]) -> Step:
+    from vkc_pin.world.task.steps import Reach
+
+    return Reach(pose)
+
+
+def _make_drive(place: Sequence[float]) -> Step:
+    from vkc_pin.world.task.steps import GoTo
+
+    return GoTo(*place)
+
+
+_MAKERS: dict[str, Callable[[Any], Any]] = {
+    "--grasp": _make_grasp,
+    "--touch": _make_touch,
+    "--place": _make_place,
+    "--release": _make_release,
+    "--reach": _make_reach,
+    "--go-to": _make_drive,
+}

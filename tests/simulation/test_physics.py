@@ -22,7 +22,7 @@ def test_missing_mujoco_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -
     for call in (import_mujoco, plan.simulate):
         with pytest.raises(vkc.InputError, match="mujoco") as caught:
             call()
-        assert caught.value.expected == 'pip install "vkc-pin[sim]"'
+        assert caught.value.expected.startswith('pip install "mujoco')
 
 
 @pytest.mark.parametrize(

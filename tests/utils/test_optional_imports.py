@@ -1,11 +1,14 @@
 from __future__ import annotations
 
+import shlex
 import sys
 import types
+from importlib.metadata import requires
 from pathlib import Path
 
 import numpy as np
 import pytest
+from packaging.requirements import Requirement
 
 import vkc_pin as vkc
 from vkc_pin.planning.base_paths.base_path import shortest_path
@@ -51,6 +54,11 @@ def test_missing_packages_name_the_extra(monkeypatch: pytest.MonkeyPatch, name: 
         optional_imports.import_optional(
             name, "import", purpose="cutting a mesh", file="robot.urdf", field="mesh"
         )
-    assert 'pip install "vkc-pin[import]"' in str(caught.value)
+    found = {requirement.name for requirement in map(Requirement, requires("vkc-pin") or ())}
+    assert {"mujoco", "xacro"} <= found
+    command = shlex.split(str(caught.value.expected).partition(" (")[0])
+    assert command[:2] == ["pip", "install"]
+    assert {Requirement(one).name for one in command[2:]} == {"mujoco", "xacro"}
+    assert caught.value.expected.endswith("(the extra `import`)")
     assert (caught.value.file, caught.value.field) == ("robot.urdf", "mesh")
     assert "cutting a mesh needs the Python package mujoco" in str(caught.value)

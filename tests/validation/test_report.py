@@ -58,13 +58,13 @@ def test_lines_describe_the_violations() -> None:
 def test_timing_describes_the_limiting_constraints() -> None:
     assert Report().timing() == []
     assert FULL.timing() == [
-        "bounded by  base_x velocity 62 % (1.0 to 2.5 s), rest 25 % (0.0 to 1.0 s)",
+        "bounded by  base_x velocity 62 % (1.0 to 2.5 s), pauses 25 % (0.0 to 1.0 s)",
         "torques     at most 50 % of the motors' limits",
         "unknown     no masses",
         "exempt      door.leaf – wall: overlap by 1.0 mm; the scene allows it",
     ]
     (listed,) = Report(bounds=(REST,) * 6).timing()
-    assert listed.count("rest") == 4
+    assert listed.count("pauses") == 4
     assert FULL.measures() == {"clearance": -0.01, "closure_error": 0.001, "torque": 0.5}
 
 

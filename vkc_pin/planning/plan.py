@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
@@ -199,15 +200,19 @@ class Plan:
         lines = [
             f"{self.scene.name}: {verdict} — {', '.join(p.name for p in self.trajectory.phases)}",
             f"  motion      {m['duration']:.1f} s, {len(self.trajectory.times)} waypoints",
-            *(f"  {line}" for line in self.report.timing()),
+            *(_wrap(f"  {line}") for line in self.report.timing()),
             f"  path        base {m['base_path_length']:.2f} m "
             f"(|dx|+|dy| {m['base_path_length_l1']:.2f} m), arm {m['arm_path_length']:.2f} rad",
             f"  clearance   {1e3 * m['clearance']:.1f} mm at the closest, "
             f"closure within {1e3 * m['closure_error']:.3f} mm",
-            f"  planning    {m['planning_time']:.3f} s after {m['build_time']:.2f} s of symbolic "
-            f"build: {times}; "
-            f"{int(m['rounds'])} rounds, {int(m['iterations'])} Ipopt iterations, "
-            f"{self.statistics.evaluations} evaluations, initial guess {self.initialization}",
+            _wrap(
+                f"  planning    {m['planning_time']:.3f} s after {m['build_time']:.2f} s of "
+                f"symbolic build: {times}; "
+                f"{_count(int(m['rounds']), 'round')}, "
+                f"{_count(int(m['iterations']), 'Ipopt iteration')}, "
+                f"{_count(self.statistics.evaluations, 'evaluation')}, "
+                f"initial guess {self.initialization}"
+            ),
             *(f"  {line}" for line in self.report.by_phase(self.trajectory) if len(self.steps) > 1),
             *(f"  {line}" for line in self.report.lines()),
         ]
@@ -407,3 +412,22 @@ def _parse_options(options: Mapping[str, Any]) -> Options:
     """Return saved options; those without `self_distance` used `dist_safe` for all pairs."""
     default = {"self_distance": options["dist_safe"]} if "dist_safe" in options else {}
     return Options(**{**default, **options})
+
+
+_WIDTH = 100  # of a summary's lines, in columns: what a notebook shows without a break
+_INDENT = 14  # of their text
+
+
+def _wrap(line: str) -> str:
+    """Return a line of the summary, broken between words if it is too wide."""
+    return textwrap.fill(
+        line,
+        _WIDTH,
+        subsequent_indent=" " * _INDENT,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

@@ -71,6 +71,21 @@ def _find_unfit_libraries() -> dict[str, tuple[str, str]]:
     return found
 
 
+def _list_requirements(extra: str) -> str:
+    """Return the packages of an extra for pip, which works for any installation of this package."""
+    from importlib.metadata import PackageNotFoundError, requires
+
+    from packaging.requirements import Requirement
+
+    found = list[str]()
+    with contextlib.suppress(PackageNotFoundError):  # a source tree that was never installed
+        for requirement in map(Requirement, requires("vkc-pin") or ()):
+            marker = requirement.marker
+            if marker and marker.evaluate({"extra": extra}) and not marker.evaluate({"extra": ""}):
+                found.append(f'"{requirement.name}{requirement.specifier}"')
+    return " ".join(found) or f'"vkc-pin[{extra}]"'
+
+
 def import_optional(
     name: str, extra: str, *, purpose: str, file: object = None, field: str | None = None
 ) -> Any:
@@ -95,6 +110,6 @@ def import_optional(
             f"{purpose} needs the Python package {package}",
             file=None if file is None else str(file),
             field=field,
-            expected=f'pip install "vkc-pin[{extra}]"',
+            expected=f"pip install {_list_requirements(extra)} (the extra `{extra}`)",
             got="not installed" if is_missing else str(error),
         ) from error

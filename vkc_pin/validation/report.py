@@ -85,7 +85,7 @@ class Bound:
     end: float
 
     def __str__(self) -> str:
-        limit = f"{self.subject} {self.kind}".strip()
+        limit = f"{self.subject} {self.kind}" if self.subject else "pauses"
         return f"{limit} {100.0 * self.share:.0f} % ({self.begin:.1f} to {self.end:.1f} s)"
 
 

@@ -26,9 +26,7 @@ from vkc_pin.world.files.documents import (
 )
 from vkc_pin.world.files.fields import Name, Number, Positive, Schema, Vector3
 
-NAMES = st.text("abcdefgh", min_size=1, max_size=4).filter(
-    lambda name: name not in ("no", "off", "on", "yes")
-)
+NAMES = st.text("abcdefghnosy", min_size=1, max_size=4)
 LEAVES = st.integers(-9, 9) | st.floats(-1e3, 1e3) | st.booleans() | NAMES
 DATA = st.recursive(
     LEAVES,
@@ -109,9 +107,18 @@ def test_invalid_yaml_raises(tmp_path: Path, text: str, line: int | None, proble
         read_yaml(file)
 
 
+@pytest.mark.parametrize("word", ["on", "off", "yes", "No", "y", "n", "truely", "ON"])
+def test_words_that_older_yaml_reads_as_booleans_are_names(tmp_path: Path, word: str) -> None:
+    file = tmp_path / "a.yaml"
+    file.write_text(f"name: {word}\nis: true\nnot: FALSE\n{word}: [{word}]\n")
+    data = read_yaml(file).data
+    assert data == {"name": word, "is": True, "not": False, word: [word]}
+
+
 @pytest.mark.parametrize(
     ("text", "line", "field", "message"),
     [
+        ("name: true\n", 1, "name", "text"),
         ("name: a\nmas: 2\n", 2, "mas", "did you mean 'mass'"),
         ("mass: 2\n", None, "name", "missing"),
         ("name: a\nmass: heavy\n", 2, "mass", "a number"),

@@ -15,23 +15,34 @@ from vkc_pin.importing.robots.arms import (
     find_arms,
     find_own_base,
     find_telescopes,
-    guess_base_kind,
 )
 from vkc_pin.world.files import resources
+from vkc_pin.world.files.srdf import SrdfGroup
 from vkc_pin.world.files.urdf import UrdfFile, read_urdf
 from vkc_pin.world.models.robot_model import build_full_model
+from vkc_pin.world.models.wheels import find_drive
 
 
-def find_all_arms(file: UrdfFile, groups: dict[str, list[str]] | None = None) -> list[Arm]:
-    solid = {shape.link for shape in file.read_shapes("collision")}
-    return find_arms(file, build_body_tree(file), groups or {}, solid)
+def find_all_arms(file: UrdfFile, groups: dict[str, SrdfGroup] | None = None) -> list[Arm]:
+    return find_arms(file, build_body_tree(file), groups or {}, find_solid_links(file))
+
+
+def find_solid_links(file: UrdfFile) -> set[str]:
+    return {shape.link for shape in file.read_shapes("collision")}
+
+
+def choose(
+    file: UrdfFile, name: str | None, groups: dict[str, SrdfGroup] | None = None
+) -> tuple[Arm, list[Arm]]:
+    arms, tree = find_all_arms(file), build_body_tree(file)
+    return choose_arm(arms, name, file, tree, groups or {}, find_solid_links(file)), arms
 
 
 def test_arms_are_found_by_their_hands(tmp_path: Path) -> None:
     file = read_urdf(write_arms(tmp_path, sides=("left_", "right_")))
     arms = find_all_arms(file)
     assert sorted(arm.name for arm in arms) == ["left", "right"]
-    left = choose_arm(arms, "Left", file, {})
+    left, _ = choose(file, "Left")
     assert left.joints == tuple(f"left_arm_{k}_joint" for k in range(1, 6))
     assert [finger.name for finger in left.fingers] == [
         "left_finger_a_joint",
@@ -39,11 +50,15 @@ def test_arms_are_found_by_their_hands(tmp_path: Path) -> None:
     ]
     assert left.palm.links == ["left_arm_5", "left_hand"]
     assert left.sure == "sure"
-    groups = {"port": [f"left_arm_{k}_joint" for k in range(1, 6)], "hand": ["left_finger_a_joint"]}
+    groups = {
+        "port": SrdfGroup(tuple(f"left_arm_{k}_joint" for k in range(1, 6)), "left_arm_5"),
+        "hand": SrdfGroup(("left_finger_a_joint",), "left_finger_a"),
+    }
     assert {arm.name for arm in find_all_arms(file, groups)} == {"port", "right"}
-    assert choose_arm(arms, "port", file, groups).name == "left"
+    for name in ("port", "hand"):  # a group of the fingers belongs to their arm
+        assert choose(file, name, groups)[0].name == "left"
     with pytest.raises(vkc.UnknownNameError) as caught:
-        choose_arm(arms, "midle", file, groups)
+        choose(file, "midle", groups)
     assert set(caught.value.choices) == {"left", "right", "port"}
 
 
@@ -136,13 +151,18 @@ def test_legs_and_hands_are_not_arms(pattern: str) -> None:
     file = read_urdf(find_robot(pattern))
     assert find_all_arms(file) == []
     with pytest.raises(vkc.InputError, match="no arm was found"):
-        choose_arm([], None, file, {})
+        choose(file, None)
 
 
 def test_wheels_determine_the_base_kind(tmp_path: Path) -> None:
-    assert guess_base_kind(read_urdf(find_robot("**/tiago.urdf")).root)[0] == "differential"
-    assert guess_base_kind(read_urdf(find_robot("**/pr2.urdf")).root)[0] == "omni"
-    assert guess_base_kind(read_urdf(write_arms(tmp_path)).root)[0] == "omni"
+    assert guess_base(read_urdf(find_robot("**/tiago.urdf"))) == "differential"
+    assert guess_base(read_urdf(find_robot("**/pr2.urdf"))) is None  # its wheels are fixed
+    assert guess_base(read_urdf(write_arms(tmp_path))) is None
+
+
+def guess_base(file: UrdfFile) -> str | None:
+    drive = find_drive(build_full_model(file), file)
+    return None if drive is None else drive.kind
 
 
 @pytest.mark.parametrize(
@@ -164,3 +184,63 @@ def test_telescope_segments_are_found(
     urdf = read_urdf(replace_in_file(file, *replacements, count=1))
     names = ("lift", "out_1", "out_2", "out_3", "out_4", "yaw_joint", "pitch_joint", "roll_joint")
     assert find_telescopes(build_full_model(urdf), names) == groups
+
+
+@pytest.mark.parametrize(
+    "prefix",
+    ["openarm_", "arm_", "left_forearm_gripper_", "Shoulder", "head_", "hipgripper_", "neck-"],
+)
+def test_fingers_may_have_the_name_of_another_part_before_theirs(
+    tmp_path: Path, prefix: str
+) -> None:
+    names = [
+        (f'"finger_{side}{end}"', f'"{prefix}Finger_{side}{end}"')
+        for side in "ab"
+        for end in ("", "_joint")
+    ]
+    (arm,) = find_all_arms(read_urdf(replace_in_file(write_arms(tmp_path), *names)))
+    assert (len(arm.joints), len(arm.fingers)) == (5, 2)
+
+
+def write_bare_arm(folder: Path, name: str) -> UrdfFile:
+    """Write an arm of five joints without fingers, the fourth of which has a name."""
+    path = write_arms(folder)
+    text = path.read_text(encoding="utf-8")
+    fingers = text[text.index('<link name="finger_a">') :]
+    replace_in_file(path, (fingers, "</robot>"), ('"arm_4', f'"{name}'))
+    return read_urdf(path)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "forearm_roll",
+        "linear_axis",
+        "bearing",
+        "rear_link",
+        "retail",
+        "bulkhead",
+        "toeplitz",
+        "LegoPart",
+    ],
+)
+def test_parts_of_words_do_not_rule_out_an_arm(tmp_path: Path, name: str) -> None:
+    (arm,) = find_all_arms(write_bare_arm(tmp_path, name))
+    assert len(arm.joints) == 5
+
+
+@pytest.mark.parametrize("name", ["ear", "left_ear_pitch", "headtilt", "knee2", "LFoot", "wheels"])
+def test_words_of_other_limbs_rule_out_an_arm(tmp_path: Path, name: str) -> None:
+    assert find_all_arms(write_bare_arm(tmp_path, name)) == []
+
+
+def test_group_of_the_srdf_is_an_arm_whatever_its_names(tmp_path: Path) -> None:
+    """It ends at its tip, or with the hand around it."""
+    file = write_bare_arm(tmp_path / "bare", "ear")
+    group = SrdfGroup(("arm_1_joint", "arm_2_joint", "arm_3_joint"), "arm_3")
+    arm, _ = choose(file, "upper", {"upper": group})
+    assert (arm.name, arm.joints, arm.palm.links[0]) == ("upper", group.joints, "arm_3")
+    file = read_urdf(write_arms(tmp_path / "whole"))
+    for joints, tip in ((("finger_a_joint",), "finger_a"), (("wrist",), "hand")):
+        arm, _ = choose(file, "end", {"end": SrdfGroup(joints, tip)})
+        assert (len(arm.joints), len(arm.fingers)) == (5, 2)

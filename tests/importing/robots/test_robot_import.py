@@ -197,6 +197,45 @@ def test_visual_shapes_replace_missing_collision_shapes(
     assert set(HAND) <= set(imported.robot.touch_links)
 
 
+@pytest.mark.parametrize(
+    "solid",
+    [("arm_5",), ("hand",), ("body",), ("arm_3", "arm_4"), ("finger_a", "finger_b"), ("arm_2",)],
+)
+def test_parts_of_an_arm_without_collision_shapes_use_their_visual_ones(
+    tmp_path: Path, solid: tuple[str, ...]
+) -> None:
+    """Only some links have collision shapes; a rigid body with one on any of its links has its."""
+    file = write_arms(tmp_path / "given")
+    text = file.read_text(encoding="utf-8")
+    links = ["body", *(f"arm_{k}" for k in range(1, 6)), *HAND]
+    for link in (name for name in links if name not in solid):
+        begin = text.index(f'<link name="{link}">')
+        end = text.index("</link>", begin)
+        text = text[:begin] + text[begin:end].replace("collision>", "visual>") + text[end:]
+    file.write_text(text, encoding="utf-8")
+    imported = vkc.importing.import_robot(file, tmp_path / "mine", samples=60)
+    bodies = [{"arm_5", "hand"}, *({link} for link in links if link not in ("arm_5", "hand"))]
+    expected = {link for body in bodies for link in (body & set(solid) or body)}
+    assert set(imported.robot.links) == expected
+    used = ", ".join(link for link in links if link in expected and link not in solid)
+    assert f"visual shapes are used for want of collision shapes: {used} [guess]" in str(imported)
+
+
+def test_arm_whose_links_cannot_collide_is_imported(tmp_path: Path) -> None:
+    """Joints about the vertical move links of different heights."""
+    links = "".join(
+        f'<link name="arm_{k}">{format_box("0.05 0.05 0.05", "0.3 0 0")}</link>' for k in range(5)
+    )
+    joints = "".join(
+        format_joint(f"j{k}", "revolute", f"arm_{k}", f"arm_{k + 1}", "0.3 0 0.3") for k in range(4)
+    )
+    file = tmp_path / "tower.urdf"
+    file.write_text(f'<robot name="tower">{links}{joints}</robot>', encoding="utf-8")
+    imported = vkc.importing.import_robot(file, tmp_path / "mine", samples=60)
+    assert not len(imported.robot.collision.collisionPairs)
+    assert "0 pairs of links are checked" in str(imported)
+
+
 STUCK = ("the gripper does not move: its fingers stay", False)
 
 

@@ -29,20 +29,37 @@ def test_foreign_elements_are_removed_and_missing_limits_noted(tmp_path: Path) -
     assert source.file.root.find("gazebo") is None
 
 
-def test_srdf_beside_the_urdf_is_ignored_if_it_names_unknown_links(tmp_path: Path) -> None:
+def test_srdf_of_another_robot_is_ignored(tmp_path: Path) -> None:
     path = write_arms(tmp_path)
-    other = "<robot name='x'><disable_collisions link1='elsewhere' link2='body'/></robot>"
+    other = "<robot name='x'><disable_collisions link1='elsewhere' link2='sun'/></robot>"
     (tmp_path / "robot.srdf").write_text(other, encoding="utf-8")
+    source = read_robot(path, tmp_path)
+    assert any("ignored robot.srdf" in note and "elsewhere, sun" in note for note in source.notes)
+    assert not source.srdf.allowed
+    with pytest.raises(vkc.InputError, match="names no link of this robot"):
+        read_source(path, tmp_path, packages={}, arguments={}, srdf=tmp_path / "robot.srdf")
+
+
+def test_srdf_with_some_stale_names_is_read(tmp_path: Path) -> None:
+    path = write_arms(tmp_path)
+    pairs = "".join(
+        f"<disable_collisions link1='body' link2='{other}'/>" for other in ("arm_1", "arm_1_sc")
+    )
+    group = "<group name='manip'><chain base_link='body' tip_link='hand'/></group>"
+    (tmp_path / "robot.srdf").write_text(f"<robot name='x'>{pairs}{group}</robot>")
+    source = read_robot(path, tmp_path)
+    assert source.srdf.allowed.keys() == {("arm_1", "body")}
+    assert source.srdf.groups["manip"].tip == "hand"
+    assert any("robot.srdf: skipped links" in note and "arm_1_sc" in note for note in source.notes)
+
+
+def test_srdf_of_a_published_robot_is_read(tmp_path: Path) -> None:
     folder = resources.find_example_robot_data()
     assert folder is not None
     panda = read_robot(folder / "robots" / "panda_description" / "urdf" / "panda.urdf", tmp_path)
-    assert panda.groups
+    assert panda.srdf.groups
     assert panda.srdf.states
     assert panda.srdf.allowed
-    source = read_robot(path, tmp_path)
-    assert any("links of another robot" in note for note in source.notes)
-    with pytest.raises(vkc.UnknownNameError):
-        read_source(path, tmp_path, packages={}, arguments={}, srdf=tmp_path / "robot.srdf")
 
 
 TEXT = """<?xml version="1.0"?>

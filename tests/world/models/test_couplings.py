@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.arm_urdf import write_arms
 from helpers.expected_errors import expect_error
 from helpers.robots import compute_placement
 from helpers.telescopes import format_joint, format_link, write_telescope
+from helpers.texts import replace_in_file
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -143,12 +145,39 @@ def test_invalid_couplings_raise(tmp_path: Path, couplings: str, field: str, mes
             "home: {out_1: 0.1, out_3: 0.0}",
             "home.out_3: this joint follows 'out_1'.*0.1, or no value.*got 0",
         ),
+        (
+            "locked_joints: {out_1: 0.1, out_2: 0.05}",
+            r"robot.yaml.*locked_joints.out_2: this joint follows 'out_1'.*0.1, or no.*got 0.05",
+        ),
+        ("locked_joints: {out_1: 0.1, out_3: 0.1, out_4: 0.0}", "locked_joints.out_4: .*got 0"),
+        (
+            "home: {out_2: 0.05}\nlocked_joints: {out_1: 0.1}",
+            "home.out_2: this joint follows 'out_1'.*0.1, or no value.*got 0.05",
+        ),
         ("home: {out_1: 0.2}", "home.out_1: .*outside the joint.s limits"),
     ],
 )
 def test_rest_positions_must_respect_couplings(tmp_path: Path, more: str, message: str) -> None:
     with expect_error(message):
         vkc.load_robot(write_telescope(tmp_path, more=more))
+
+
+@pytest.mark.parametrize("positions", [{"a": 0.03, "b": 0.01}, {"b": 0.01}, {"a": -0.02, "b": 0.0}])
+def test_locked_fingers_must_respect_couplings(tmp_path: Path, positions: dict[str, float]) -> None:
+    """Of two fingers beside the path to the tool, the second one moves 1 cm behind the first."""
+    file = write_arms(tmp_path)
+    joint = '<axis xyz="0 -1 0"/>'
+    mimic = '<mimic joint="finger_a_joint" offset="-0.01"/>'
+    replace_in_file(file, (joint, joint + mimic), ('lower="0.0"', 'lower="-0.05"'))
+    locked = {f"finger_{name}_joint": value for name, value in positions.items()}
+    with expect_error("this joint follows 'finger_a_joint'", field="locked_joints.finger_b_joint"):
+        vkc.load_robot(file, tool_frame="hand", locked_joints=locked, pairs="all")
+    leader = positions.get("a", 0.0)
+    locked["finger_b_joint"] = leader - 0.01
+    robot = vkc.load_robot(file, tool_frame="hand", locked_joints=locked, pairs="all")
+    place = robot.model.frames[robot.model.getFrameId("finger_b")].placement
+    between = robot.model.frames[robot.model.getFrameId("finger_a")].placement.actInv(place)
+    assert between.translation[1] == pytest.approx(-(2.0 * leader - 0.01), abs=1e-9)
 
 
 def test_locking_a_leader_locks_its_followers(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,10 @@ import pytest
 from helpers.arm_urdf import write_arms
 from helpers.expected_errors import expect_error
 from helpers.robots import compute_placement, write_small_urdf
+from helpers.texts import format_box, format_fixed_link
 
 from vkc_pin import Robot, UnknownNameError, load_robot
+from vkc_pin.world.files.urdf import read_urdf
 from vkc_pin.world.models.robot_file import find_robot
 
 
@@ -162,13 +165,17 @@ def test_invalid_files_raise(tmp_path: Path) -> None:
             load_robot(file)
 
 
-def test_srdf_that_allows_all_pairs_raises(tmp_path: Path) -> None:
-    pairs = "".join(
-        f'<disable_collisions link1="l{i}" link2="l{j}"/>' for i in range(4) for j in range(i)
-    )
-    (tmp_path / "small.srdf").write_text(f"<robot>{pairs}</robot>")
+def test_srdf_that_allows_all_pairs_raises_if_some_can_collide(tmp_path: Path) -> None:
+    for file in (write_arms(tmp_path / "arms"), write_small_urdf(tmp_path)):
+        links = read_urdf(file).links
+        pairs = "".join(
+            f'<disable_collisions link1="{one}" link2="{other}"/>'
+            for one, other in itertools.combinations(links, 2)
+        )
+        file.with_suffix(".srdf").write_text(f"<robot>{pairs}</robot>")
     with expect_error("no pair of links"):
-        load_robot(write_small_urdf(tmp_path))
+        load_robot(tmp_path / "arms" / "robot.urdf")
+    assert not len(load_robot(file).collision.collisionPairs)  # its small links are far apart
 
 
 @pytest.mark.parametrize("field", ["locked_joints", "home"])
@@ -257,13 +264,77 @@ def test_groups_of_the_srdf_select_the_tool_frame(tmp_path: Path) -> None:
     for arguments, tool in (({}, "l2"), ({"arm": "whole"}, "l3"), ({"tool_frame": "l1"}, "l1")):
         robot = load_robot(tmp_path, **arguments)
         assert (robot.tool_frame, len(robot.home)) == (tool, int(tool[1]))
-    with pytest.raises(UnknownNameError, match=r"arm: .*'short'.* There are: short, whole"):
+    with pytest.raises(UnknownNameError, match=r"arm: .*'short'.* There are: short, whole, links"):
         load_robot(tmp_path, arm="shrt")
     with expect_error("exclude each other"):
         load_robot(tmp_path, arm="short", tool_frame="l2")
     write_yaml(tmp_path, "tool_frame: l3\narm: short\n")
     with expect_error(r"robot\.yaml:3: arm: .*exclude each other"):
         load_robot(tmp_path)
+
+
+GROUPS = (
+    '<group name="whole"><chain base_link="l0" tip_link="l3"/></group>'
+    '<group name="links"><link name="l1"/><link name="l2"/></group>'
+    '<group name="both"><group name="links"/><link name="l3"/></group>'
+)
+
+
+@pytest.mark.parametrize(
+    ("group", "tool", "home"),
+    [
+        ("whole", "l3", [0.3, 1.2, -1.0]),
+        ("links", "l2", [-0.4, 1.5]),
+        ("both", "l3", [0.3, 1.2, -1.0]),
+    ],
+)
+def test_home_is_the_state_of_the_planned_group(
+    tmp_path: Path, group: str, tool: str, home: list[float]
+) -> None:
+    """Groups of links and of groups have states, of the same name as those of another group."""
+    values = {"whole": [0.3, 1.2, -1.0], "links": [-0.4, 1.5]}
+    states = "".join(
+        f'<group_state name="home" group="{name}">'
+        + "".join(f'<joint name="j{k}" value="{value}"/>' for k, value in enumerate(positions))
+        + "</group_state>"
+        for name, positions in values.items()
+    )
+    file = write_small_urdf(tmp_path)
+    file.with_suffix(".srdf").write_text(f"<robot>{GROUPS}{states}</robot>")
+    robot = load_robot(file, arm=group)
+    assert (robot.tool_frame, robot.home.tolist()) == (tool, home)
+
+
+def test_default_of_a_link_is_as_good_as_its_pairs(tmp_path: Path) -> None:
+    """A coarse link around the last ones is checked against the base alone."""
+    coarse = format_fixed_link("coarse", "l3", "0 0 -0.1", format_box("0.9 0.9 0.9"))
+    file = write_small_urdf(tmp_path, links=coarse)
+    by_pairs = "".join(f'<disable_collisions link1="coarse" link2="l{k}"/>' for k in range(1, 4))
+    by_default = (
+        '<disable_default_collisions link="coarse"/><enable_collisions link1="l0" link2="coarse"/>'
+    )
+    found = []
+    for text in (by_pairs, by_default, ""):
+        file.with_suffix(".srdf").write_text(f"<robot>{text}</robot>")
+        robot = load_robot(file, tool_frame="l3", home={"j1": 1.0})
+        pairs = robot.collision.collisionPairs
+        found.append({frozenset((robot.link_of(p.first), robot.link_of(p.second))) for p in pairs})
+    assert found[0] == found[1] < found[2]
+    assert [pair for pair in found[0] if "coarse" in pair] == [frozenset(("l0", "coarse"))]
+
+
+def test_stale_names_of_the_srdf_are_warned_of(tmp_path: Path) -> None:
+    file = write_small_urdf(tmp_path)
+    pairs = "".join(f'<disable_collisions link1="l0" link2="{name}"/>' for name in ("l2", "l2_sc"))
+    file.with_suffix(".srdf").write_text(f"<robot>{pairs}</robot>")
+    with pytest.warns(UserWarning, match=r"small\.srdf: skipped links .*: l2_sc"):
+        robot = load_robot(file)
+    pairs_left = [(p.first, p.second) for p in robot.collision.collisionPairs]
+    assert (0, 2) not in pairs_left
+    assert (0, 3) in pairs_left
+    file.with_suffix(".srdf").write_text("<robot><disable_default_collisions link='x'/></robot>")
+    with expect_error("names no link of this robot"):
+        load_robot(file)
 
 
 def test_folders_do_not_shadow_robot_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -306,7 +306,8 @@ def _facts(robot: Robot, folder: Path) -> dict[str, Any]:
     )
     every = load_robot(folder, pairs="all")
     (srdf,) = folder.glob("*.srdf")
-    look = Clearances(set_collision_pairs(every, read_srdf(srdf, links=every.file.links).allowed))
+    allowed = read_srdf(srdf, every.file.root).allowed
+    look = Clearances(set_collision_pairs(every, allowed))
     look.place(robot.home)  # also of pairs that loading exempts since they overlap there
     links = {
         tuple(sorted((robot.link_of(pair.first), robot.link_of(pair.second))))

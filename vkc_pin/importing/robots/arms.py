@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
@@ -12,8 +11,11 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.words import list_words, split_words
+from vkc_pin.world.files.srdf import SrdfGroup
 from vkc_pin.world.files.urdf import UrdfFile
-from vkc_pin.world.models.robot_model import build_full_model
+from vkc_pin.world.models.robot_model import build_full_model, find_joint_limits
+from vkc_pin.world.models.wheels import has_wheel_name
 
 __all__ = [
     "Arm",
@@ -23,7 +25,6 @@ __all__ = [
     "find_arms",
     "find_own_base",
     "find_telescopes",
-    "guess_base_kind",
     "sample_points",
 ]
 
@@ -35,22 +36,16 @@ _JAW_ANGLES = np.linspace(-0.8, 0.8, 9)  # [rad]
 _POINTS = 120  # sampled points of a link
 _LEVEL = 0.01  # sine of the largest slope of a floor, and of an axis that counts as vertical
 _PARALLEL = 1.0 - 1e-6  # smallest cosine between the axes of a telescope's segments
-_HAND_WORDS = re.compile(r"finger|thumb|gripper|jaw|knuckle|claw|fngr|grip", re.IGNORECASE)
-_ARM_WORDS = re.compile(
-    r"arm|shoulder|elbow|wrist|hand|gripper|ur\d|panda|lift|flange", re.IGNORECASE
+_HAND_WORDS = list_words("finger thumb gripper jaw knuckle claw fngr grip")
+_ARM_WORDS = list_words("arm openarm xarm shoulder elbow wrist hand gripper ur panda lift flange")
+_TRUNK_WORDS = list_words("shoulder elbow arm neck head hip")
+_WRIST_WORDS = list_words("wrist yaw roll pitch")
+_OTHER_WORDS = list_words(
+    "leg hip knee ankle foot feet thigh calf shank haa hfe kfe hx hy kn toe wheel caster castor "
+    "head neck eye ear camera antenna tail propeller propellor rotor laser"
 )
-_TRUNK_WORDS = re.compile(r"shoulder|elbow|arm(?!ature)|neck|head|hip", re.IGNORECASE)
-_WRIST_WORDS = re.compile(r"wrist|yaw|roll|pitch", re.IGNORECASE)
-_OTHER_WORDS = re.compile(
-    r"leg(?!o)|hip|knee|ankle|foot|feet|thigh|calf|shank|haa|hfe|kfe|toe|wheel|caster|head|neck"
-    r"|eye|camera|antenna|tail|propell|rotor"
-    r"|_h[xy]_|_kn_|laser|tilt_mount|ear",
-    re.IGNORECASE,
-)
-_SIDES = {
-    "left": re.compile(r"left|(^|[_\W])l([_\W]|$)|^l[_A-Z]|^L[A-Z]", 0),
-    "right": re.compile(r"right|(^|[_\W])r([_\W]|$)|^r[_A-Z]|^R[A-Z]", 0),
-}
+_SIDES = {"left": {"left", "l"}, "right": {"right", "r"}}
+_LONGEST_LIFT = 10.0  # [m] travel beyond which a vertical slide is no lift
 
 
 @dataclass(eq=False)
@@ -144,11 +139,14 @@ def find_own_base(file: UrdfFile, root: Body, solid: Set[str]) -> tuple[str, ...
     """Return the joints of a mobile base in the robot's file.
 
     These are at least two joints in sequence from the root whose parent links have no shapes, and
-    that slide along the floor or rotate about the vertical. Lifts belong to the arm.
+    that slide along the floor, slide without a lift's limits, or rotate about the vertical. Lifts
+    belong to the arm. If the robot has wheels, all joints in that sequence belong to the base, as
+    they carry the wheels.
     """
     full = build_full_model(file)
     data, joints, body = full.createData(), list[str](), root
     pin.computeJointJacobians(full, data, pin.neutral(full))
+    carries_wheels = any(has_wheel_name(joint) for joint in file.root.findall("joint"))
     while len(body.children) == 1 and not solid & set(body.links):
         body = body.children[0]
         number = full.getJointId(body.name)
@@ -157,37 +155,16 @@ def find_own_base(file: UrdfFile, root: Body, solid: Set[str]) -> tuple[str, ...
         jacobian = pin.getJointJacobian(full, data, number, pin.LOCAL_WORLD_ALIGNED)
         slide, turn = np.split(np.abs(jacobian[:, full.joints[number].idx_v]), 2)
         slides_level = not turn.any() and slide[2] < _LEVEL
+        slides_far = not turn.any() and np.ptp(find_joint_limits(full, body.name)) > _LONGEST_LIFT
         turns_upright = turn[2] > 1.0 - _LEVEL
-        if not (slides_level or turns_upright):
+        if not (slides_level or slides_far or turns_upright or carries_wheels):
             break
         joints.append(body.name)
-    return tuple(joints) if len(joints) > 1 else ()
-
-
-def guess_base_kind(root: ElementTree.Element) -> tuple[str, str]:
-    """Guess from the wheels how a base moves; return its kind and the evidence."""
-    turning = [
-        joint.get("name", "").lower()
-        for joint in root.findall("joint")
-        if joint.get("type") == "continuous"
-    ]
-    wheels = [name for name in turning if "wheel" in name]
-    names = " ".join(link.get("name", "").lower() for link in root.findall("link"))
-    casters = "caster" in names
-    if any(word in names for word in ("mecanum", "omni", "swerve", "suspension_steer")):
-        return "omni", "names of wheels"
-    if wheels and casters and len(wheels) > 4:
-        return "omni", "wheels on steered casters"
-    if wheels:
-        return "differential", f"{len(wheels)} wheels"
-    return (
-        "omni",
-        "no wheels: an omnidirectional base is assumed; use `fixed` for an arm on a table",
-    )
+    return tuple(joints) if len(joints) > 1 or carries_wheels else ()
 
 
 def find_arms(
-    file: UrdfFile, root: Body, groups: Mapping[str, Sequence[str]], solid: Set[str]
+    file: UrdfFile, root: Body, groups: Mapping[str, SrdfGroup], solid: Set[str]
 ) -> list[Arm]:
     """Find the arms of a robot, best first.
 
@@ -210,15 +187,11 @@ def find_arms(
     carrying = {id(above) for palm in palms for above in palm.path()}
     tips = [body for body in everything if not body.children and id(body) not in inside | carrying]
     for body in palms + tips:
-        fingers = tuple(
-            child
-            for child in body.children
-            if any(solid & set(below.links) for below in child.subtree())
-        )
+        fingers = _find_fingers(body, solid)
         joints = _find_planned_joints(body, base)
         own = [*joints[-5:], *body.links[:2]]
-        other = sum(bool(_OTHER_WORDS.search(name)) for name in own)
-        words = sum(bool(_ARM_WORDS.search(name)) for name in own)
+        other = sum(_has_word(name, _OTHER_WORDS) for name in own)
+        words = sum(_has_word(name, _ARM_WORDS) for name in own)
         if not joints or other > words or (body in tips and (len(joints) <= _ARM or other)):
             continue
         score = 3.0 * bool(fingers) + 2.0 * bool(words) + min(len(joints), 7) / 7.0
@@ -244,10 +217,25 @@ def find_arms(
 
 
 def choose_arm(
-    arms: Sequence[Arm], name: str | None, file: UrdfFile, groups: Mapping[str, Sequence[str]]
+    arms: Sequence[Arm],
+    name: str | None,
+    file: UrdfFile,
+    root: Body,
+    groups: Mapping[str, SrdfGroup],
+    solid: Set[str],
 ) -> Arm:
-    """Choose the arm with a name, of an SRDF group, whose name contains it, or the best one."""
-    if not arms:
+    """Choose the arm with a name, of an SRDF group, whose name contains it, or the best one.
+
+    Args:
+        arms: The arms that were found.
+        name: The name, or None.
+        file: The robot's file.
+        root: Its tree, see `build_body_tree`.
+        groups: The groups of its SRDF.
+        solid: Links with collision shapes.
+    """
+    group = None if name is None else groups.get(name)
+    if not arms and group is None:
         expected = (
             "at least four joints in a chain, or a hand after three; or the name of a tool_frame"
         )
@@ -255,15 +243,19 @@ def choose_arm(
     if name is None:
         return arms[0]
     fitting = [arm for arm in arms if arm.name == name]
-    fitting = fitting or [
-        arm for arm in arms if _get_last_joints(arm.joints) <= set(groups.get(name, ()))
-    ]
+    if group is not None:
+        members = set(group.joints)
+        fitting = fitting or [arm for arm in arms if _get_last_joints(arm.joints) <= members]
+        stated = _make_arm_of_group(name, group, file, root, solid)
+        fitting = fitting or [arm for arm in arms if stated and arm.palm.links == stated.palm.links]
+        if stated is not None:
+            fitting.append(stated)
     fitting = fitting or [arm for arm in arms if name.lower() in arm.name.lower()]
     if not fitting:
         also = [
-            group
-            for group, joints in groups.items()
-            if any(_get_last_joints(arm.joints) <= set(joints) for arm in arms)
+            other
+            for other, listed in groups.items()
+            if any(_get_last_joints(arm.joints) <= set(listed.joints) for arm in arms)
         ]
         raise UnknownNameError(
             "arm",
@@ -273,6 +265,31 @@ def choose_arm(
             field="arm",
         )
     return fitting[0]
+
+
+def _make_arm_of_group(
+    name: str, group: SrdfGroup, file: UrdfFile, root: Body, solid: Set[str]
+) -> Arm | None:
+    """Return the arm that ends at the tip of a group, or with the hand around it, if it moves."""
+    tip = next(body for body in root.subtree() if group.tip in body.links)
+    palms = [body for body in tip.path() if _is_palm(body, file)]
+    palm = palms[0] if palms else tip
+    joints = _find_planned_joints(palm, find_own_base(file, root, solid))
+    if not joints:
+        return None
+    fingers = _find_fingers(palm, solid) if palms else ()
+    count = f"{len(fingers)} fingers" if fingers else "no fingers"
+    why = f"{len(joints)} joints, {count}, a group of the SRDF"
+    return Arm(name, joints, palm, fingers, "sure", why, 0.0)
+
+
+def _find_fingers(palm: Body, solid: Set[str]) -> tuple[Body, ...]:
+    """Return the first bodies of the fingers with shapes."""
+    return tuple(
+        child
+        for child in palm.children
+        if any(solid & set(below.links) for below in child.subtree())
+    )
 
 
 def find_telescopes(full: pin.Model, joints: Sequence[str]) -> list[tuple[str, ...]]:
@@ -316,19 +333,24 @@ def _is_palm(body: Body, file: UrdfFile) -> bool:
         or not any(below.is_planned for below in body.subtree()[1:])
     ):
         return False
-    if any(_TRUNK_WORDS.search(f"{child.name} {child.links[0]}") for child in body.children):
+    names = [f"{child.name} {child.links[0]}" for child in body.children]
+    # A finger may have its arm's name before its own.
+    if any(_has_word(name, _TRUNK_WORDS) and not _has_word(name, _HAND_WORDS) for name in names):
         return False
     if len(body.children) == 1:
         jaw = body.children[0]
         return (
-            bool(_HAND_WORDS.search(f"{jaw.name} {jaw.links[0]}"))
-            and not _WRIST_WORDS.search(jaw.name)
+            _has_word(names[0], _HAND_WORDS)
+            and not _has_word(jaw.name, _WRIST_WORDS)
             and not jaw.children
             and _has_jaw_beside(body, jaw, file)
         )
-    named = [bool(_HAND_WORDS.search(f"{child.name} {child.links[0]}")) for child in body.children]
-    other = [bool(_OTHER_WORDS.search(f"{child.name} {child.links[0]}")) for child in body.children]
-    return any(named) or not any(other)
+    named = any(_has_word(name, _HAND_WORDS) for name in names)
+    return named or not any(_has_word(name, _OTHER_WORDS) for name in names)
+
+
+def _has_word(name: str, words: Set[str]) -> bool:
+    return not words.isdisjoint(split_words(name))
 
 
 def _has_jaw_beside(palm: Body, jaw: Body, file: UrdfFile) -> bool:
@@ -367,14 +389,14 @@ def _find_planned_joints(body: Body, base: Collection[str]) -> tuple[str, ...]:
     return tuple(above.name for above in body.path() if above.is_planned and above.name not in base)
 
 
-def _choose_name(joints: Sequence[str], palm: Body, groups: Mapping[str, Sequence[str]]) -> str:
+def _choose_name(joints: Sequence[str], palm: Body, groups: Mapping[str, SrdfGroup]) -> str:
     """Return an arm's name: that of the smallest group with its joints, its side, or its palm."""
-    if fitting := [
-        name for name, members in groups.items() if _get_last_joints(joints) <= set(members)
-    ]:
-        return min(fitting, key=lambda name: (len(groups[name]), name))
-    for side, pattern in _SIDES.items():
-        if sum(bool(pattern.search(name)) for name in [*joints[-3:], palm.links[0]]) >= 2:
+    last = _get_last_joints(joints)
+    fitting = [name for name, group in groups.items() if last <= set(group.joints)]
+    if fitting:
+        return min(fitting, key=lambda name: (len(groups[name].joints), name))
+    for side, words in _SIDES.items():
+        if sum(_has_word(name, words) for name in [*joints[-3:], palm.links[0]]) >= 2:
             return side
     return palm.links[0]
 

@@ -22,12 +22,18 @@ from vkc_pin.importing.robots.rest_configuration import Clearances, find_insepar
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import check_integer, check_number
 from vkc_pin.world.files.meshes import load_mesh
-from vkc_pin.world.models.couplings import DEFAULT_JOINT_VELOCITY, DEFAULT_SLIDE_VELOCITY
+from vkc_pin.world.models.couplings import (
+    DEFAULT_JOINT_VELOCITY,
+    DEFAULT_SLIDE_VELOCITY,
+    find_joint_path,
+)
 from vkc_pin.world.models.dynamics import UNLIMITED
 from vkc_pin.world.models.gripper import find_thickest_rod
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
+from vkc_pin.world.models.robot_model import build_full_model
 from vkc_pin.world.models.shapes import compute_bounding_box
+from vkc_pin.world.models.wheels import describe_misplaced_axle, find_drive, is_on_axle
 
 __all__ = ["Diagnosis", "Finding", "doctor"]
 
@@ -50,8 +56,8 @@ class Finding:
     Attributes:
         level: "fault" (planning fails), "limitation" (a common task that the robot cannot do),
             "warning" (planning may fail, or values are assumed), "note".
-        topic: "home", "pairs", "units", "limits", "effort", "mass", "hand", "shapes", "guessed" or
-            "file".
+        topic: "home", "pairs", "base", "units", "limits", "effort", "mass", "hand", "shapes",
+            "guessed" or "file".
         text: The finding.
         hint: A remedy, or "".
     """
@@ -112,7 +118,8 @@ def doctor(
     """Examine a robot.
 
     The examination covers the home configuration (collisions, pairs closer than the margin, the
-    floor), pairs of links that no random configuration separates by the margin, missing limits,
+    floor), pairs of links that no random configuration separates by the margin, the axle of wheels,
+    missing limits,
     efforts and masses, units, the hand and the bars that it can grasp, and meshes that are far
     from convex.
 
@@ -137,6 +144,7 @@ def doctor(
     findings = [
         *_check_home(loaded, clearance),
         *_check_pairs(loaded, clearance, samples, seed),
+        *_check_wheels(loaded),
         *_check_units(loaded),
         *_check_limits_and_masses(loaded),
         *_check_hand(loaded, seed),
@@ -202,6 +210,20 @@ def _check_pairs(robot: Robot, margin: float, samples: int, seed: int) -> list[F
     ]
     count = f"{len(set(pairs))} pairs of links are checked ({len(pairs)} of convex pieces)"
     return [*findings, Finding("note", "pairs", count)]
+
+
+def _check_wheels(robot: Robot) -> list[Finding]:
+    """Report an axle away from the root, with which wheels would slide sideways."""
+    full = build_full_model(robot.file)
+    path = [str(full.names[joint]) for joint in find_joint_path(full, robot.tool_frame)]
+    drive = find_drive(full, robot.file, path)
+    if drive is None or is_on_axle(drive) or robot.base == "fixed":
+        return []
+    level = "warning" if robot.base == "omni" else "fault"
+    text = f"{describe_misplaced_axle(drive)}: as a `{drive.kind}` base its wheels would slide"
+    hint = "a root link there, with x in the direction in which they roll, "
+    hint += "as `vkc-pin import-robot` writes it"
+    return [Finding(level, "base", text, hint)]
 
 
 def _check_units(robot: Robot) -> list[Finding]:

@@ -12,14 +12,20 @@ import pinocchio as pin
 
 from vkc_pin.importing.robots.arms import Arm, Body, sample_points
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.words import split_words
 from vkc_pin.world.files.urdf import UrdfFile
+from vkc_pin.world.models.couplings import find_followers
 from vkc_pin.world.models.gripper import (
     WIDEST_BAR,
     PlacedShape,
     find_thickest_rod,
     find_widest_bar,
 )
-from vkc_pin.world.models.robot_model import compute_rest_positions, make_configuration
+from vkc_pin.world.models.robot_model import (
+    compute_rest_positions,
+    find_joint_limits,
+    make_configuration,
+)
 
 __all__ = ["Hand", "analyze_hand"]
 
@@ -122,15 +128,21 @@ class _HandAnalysis:
             len(fingers) == 1 and not len(self._find_points(self._arm.palm, {}, alone=True))
         ):
             return self._use_flange(touch)
-        first, second = self._divide_fingers(fingers)
+        joints = self._find_finger_joints(fingers)
+        # One motor with <mimic> joints moves a linkage of fingers and of bars beside them.
+        is_driven = len(joints) == 1 and len(fingers) > _GRIPPER
         self._approach = self._find_approach(fingers)
-        joints = [body.name for finger in fingers for body in finger.subtree() if body.is_planned]
+        first, second = self._divide_fingers(fingers)
+        if is_driven:
+            first, second = self._divide_by_motion(fingers, joints[0]) or (first, second)
+            first, second = self._leave_out_bars(first), self._leave_out_bars(second)
+            fingers = [*first, *second]
         opened, closed_positions, gap, closed = self._find_opening(first, second, joints)
         linked = {name for linkage in self._linkages for name in linkage[0]}
         tool, opened = self._place_tool(first, second, opened, closed_positions, linked)
         gap = self._measure_gap(first, second, opened)
         moves = gap - closed
-        is_linkage = bool(linked) and linked.issuperset(joints)
+        is_linkage = is_driven or (bool(linked) and linked.issuperset(joints))
         sure = (
             "sure" if len(fingers) == 2 and moves > 0.01 else "likely" if moves > 0.01 else "guess"
         )
@@ -153,6 +165,44 @@ class _HandAnalysis:
         return Hand(
             self._link, tool, opened, closing_joints if known else {}, float(gap), touch, sure, why
         )
+
+    def _find_finger_joints(self, fingers: Sequence[Body]) -> list[str]:
+        """Return the joints of fingers, and those of the hand that these follow."""
+        inside = [body for finger in fingers for body in finger.subtree()]
+        joints = [body.name for body in inside if body.is_planned]
+        of_hand = {body.name for body in self._arm.palm.subtree()[1:] if body.is_planned}
+        followers = find_followers(self._file.root)
+        leaders = [followers[body.name].leader for body in inside if body.name in followers]
+        joints += [leader for leader in leaders if leader in of_hand]
+        return list(dict.fromkeys(joints))
+
+    def _divide_by_motion(
+        self, fingers: Sequence[Body], driver: str
+    ) -> tuple[list[Body], list[Body]] | None:
+        """Return the fingers that one joint moves to either side, or None if all go one way."""
+        ends = [
+            [self._find_points(finger, {driver: limit}).mean(axis=0) for finger in fingers]
+            for limit in find_joint_limits(self._full, driver)
+            if np.isfinite(limit)
+        ]
+        if len(ends) < 2:
+            return None
+        motions = np.array(ends[1]) - np.array(ends[0])
+        # Most of the motion is in one direction, after that of all fingers together is subtracted.
+        apart = motions - motions.mean(axis=0)
+        direction = np.linalg.svd(apart)[2][0]
+        first = [
+            finger
+            for finger, motion in zip(fingers, apart, strict=True)
+            if motion @ direction > 0.0
+        ]
+        second = [finger for finger in fingers if finger not in first]
+        return (first, second) if first and second else None
+
+    def _leave_out_bars(self, fingers: Sequence[Body]) -> list[Body]:
+        """Return the fingers on one side whose tips are foremost: bars of a linkage end before."""
+        tips = [float((self._find_fingertip(one, {}) @ self._approach).max()) for one in fingers]
+        return [one for one, tip in zip(fingers, tips, strict=True) if tip > max(tips) - _TIP]
 
     def _place(self, positions: Mapping[str, float]) -> pin.SE3:
         """Set joint positions, and return the palm's placement."""
@@ -182,7 +232,7 @@ class _HandAnalysis:
         thumbs = [
             finger
             for finger in fingers
-            if any("thumb" in link.lower() for body in finger.subtree() for link in body.links)
+            if any("thumb" in split_words(link) for body in finger.subtree() for link in body.links)
         ]
         if thumbs and len(thumbs) < len(fingers):
             return thumbs, [finger for finger in fingers if finger not in thumbs]

@@ -25,7 +25,6 @@ from vkc_pin.importing.robots.arms import (
     find_arms,
     find_own_base,
     find_telescopes,
-    guess_base_kind,
 )
 from vkc_pin.importing.robots.doctor import Diagnosis, Finding, doctor
 from vkc_pin.importing.robots.hand_checks import (
@@ -56,6 +55,7 @@ from vkc_pin.importing.targets import (
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import check_bool, check_integer, check_mapping, check_text
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.words import split_words
 from vkc_pin.world.files.resources import check_path, choose_file_names
 from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.files.writing import write_folder_atomically
@@ -64,6 +64,7 @@ from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.models.robot_model import build_full_model
 from vkc_pin.world.models.self_collisions import sample_allowed_pairs, set_collision_pairs
+from vkc_pin.world.models.wheels import Drive, describe_misplaced_axle, find_drive, is_on_axle
 
 __all__ = ["PICTURE", "ImportedRobot", "import_robot"]
 
@@ -76,8 +77,10 @@ _NEAR, _MOSTLY = 300, 0.75
 _NEIGHBOURS = Options().dist_safe + 0.005
 _CLOSED = 0.01  # [m] opening below which fingers that do not move can grasp nothing
 _FINGERS = "in robot.yaml: `gripper: {FINGER_JOINT: {closed: POSITION, open: POSITION}}`"
-_AT_END = 3  # joints after which links belong to an arm or its hand
+# Joints after which links belong to an arm or its hand; a chain of one more is an arm.
+_AT_END = 3
 _STANDING = 0.005  # [m] height up to which a root stands on the floor
+_NO_WHEELS = "no wheels: an omnidirectional base is assumed; use `fixed` for an arm on a table"
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,6 +188,8 @@ class _Importer:
         (stem,) = choose_file_names([name], fallback="robot")
         self._settings: dict[str, Any] = {"urdf": f"{stem}.urdf", "srdf": f"{stem}.srdf"}
         self._base = "omni"
+        self._drive: Drive | None = None
+        self._group: str | None = None
         self._findings = [
             *(Finding("warning", "shapes", text) for text in source.warnings),
             *(Finding("note", "file", text) for text in source.notes),
@@ -207,12 +212,12 @@ class _Importer:
         self._use_visual_shapes(tree)
         solid = {shape.link for shape in self._file.read_shapes("collision")}
         base_joints = find_own_base(self._file, tree, solid)
-        arms = find_arms(self._file, tree, self._source.groups, solid)
-        chosen = (
-            None
-            if tool_frame is not None and not arms
-            else choose_arm(arms, arm, self._file, self._source.groups)
-        )
+        groups = self._source.srdf.groups
+        arms = find_arms(self._file, tree, groups, solid)
+        chosen = None
+        if arms or arm in groups or tool_frame is None:
+            chosen = choose_arm(arms, arm, self._file, tree, groups, solid)
+            self._group = arm if arm in groups else None
         self._set_arm(chosen, arms, base_joints)
         root, pieces, notes = write_meshes(self._file, self._folder, most_pieces=most_pieces)
         self._findings += [Finding("warning", "shapes", note) for note in notes]
@@ -226,7 +231,7 @@ class _Importer:
         if tool_frame is not None:
             self._settings["tool_frame"] = tool_frame
         robot = self._remove_columns(self._remove_envelopes(self._write_and_load()))
-        robot = self._place_on_floor(robot, seed)
+        robot = self._place_root(robot, seed)
         self._report(pieces, self._find_home(robot, samples, seed))
         robot = load_robot(self._folder / "robot.yaml")
         if hand is not None and tool_frame is None:
@@ -246,14 +251,14 @@ class _Importer:
         return ImportedRobot(self._folder, robot, names, tuple(pieces), diagnosis)
 
     def _use_visual_shapes(self, tree: Body) -> None:
-        """Use visual shapes for collision where the file has none: everywhere, or for hands."""
+        """Use visual shapes for collision where the file has none: everywhere, or on an arm."""
         solid = {shape.link for shape in self._file.read_shapes("collision")}
         links = set[str]()
         for body in tree.subtree():
-            below = {link for part in body.subtree() for link in part.links}
-            at_end = sum(part.is_planned for part in body.path()) >= _AT_END
-            if (at_end or not solid) and not solid & below:
-                links |= below
+            joints_above = sum(part.is_planned for part in body.path())
+            is_on_arm = joints_above >= _AT_END or joints_above + body.depth() > _AT_END
+            if not solid or (is_on_arm and not solid & set(body.links)):
+                links |= set(body.links)
         used = list[str]()
         for link in self._file.root.findall("link"):
             for visual in link.findall("visual") if link.get("name") in links else ():
@@ -283,12 +288,9 @@ class _Importer:
                 "the planner's base replaces that of the file: "
                 f"{', '.join(base_joints)} are locked",
             )
-        self._base, why = guess_base_kind(self._file.root)
-        kind = self._base
-        sure = "likely" if kind != "omni" else "guess"
-        self._guess(
-            sure, f"base: {kind} ({why})", "if it is wrong: `base` in scene.yaml and other scenes"
-        )
+        carrying = base_joints if chosen is None else (*base_joints, *chosen.joints)
+        self._drive = find_drive(build_full_model(self._file), self._file, carrying)
+        self._set_base(self._drive)
         if chosen is not None:
             for leader, *others in find_telescopes(build_full_model(self._file), chosen.joints):
                 self._settings.setdefault("couplings", {}).update(dict.fromkeys(others, leader))
@@ -305,6 +307,20 @@ class _Importer:
                 f"arm: {chosen.name}, {chosen.why}{also}",
                 "to choose another: arm, --arm" if others else "",
             )
+
+    def _set_base(self, drive: Drive | None) -> None:
+        self._base, why, sure = "omni", _NO_WHEELS, "guess"
+        if drive is not None:
+            self._base, why, sure = drive.kind, drive.why, "likely"
+            if drive.turning_radius is not None:
+                radius = round(drive.turning_radius, 3)
+                self._settings["base"] = {"turning_radius": radius}
+                why += f", turning radius {radius:g} m"
+        self._guess(
+            sure,
+            f"base: {self._base} ({why})",
+            "if it is wrong: `base` in scene.yaml and other scenes",
+        )
 
     def _set_hand(self, hand: Hand, tool_frame: str | None) -> None:
         links = [link for link in hand.touch_links if link in set(self._file.links)]
@@ -425,31 +441,42 @@ class _Importer:
             self._findings.append(Finding("warning", "shapes", text, hint))
         return self._write_and_load()
 
-    def _place_on_floor(self, robot: Robot, seed: int) -> Robot:
-        """Return the robot with its root raised onto the floor, with the arm clear of it."""
+    def _place_root(self, robot: Robot, seed: int) -> Robot:
+        """Return the robot with its root on the floor, and on the axle of wheels.
+
+        The arm is clear of the floor, and x is the direction in which the wheels roll.
+        """
         low, reachable = measure_floor_heights(robot, seed=seed)
+        why = "it stands on its lowest point"
+        footprint = _find_footprint(robot)
+        if footprint is not None:
+            name, low = footprint
+            why = f"{name} is on the floor"
         lift = -low if abs(low) > _STANDING else 0.0
         raised = max(0.0, HOME_ROOM - reachable - lift)
-        if lift + raised == 0.0:
+        height = round(lift + raised, 6)
+        drive = self._drive
+        is_beside = drive is not None and not is_on_axle(drive)
+        if height == 0.0 and not is_beside:
             return robot
-        floor, root = (
-            choose_free_name("floor", self._get_names()),
-            build_body_tree(self._file).links[0],
-        )
+        place = np.array([0.0, 0.0, -height])  # of the new root in the old one
+        turn = np.eye(3)
+        if drive is not None and is_beside:
+            place[:2] = drive.center
+            turn = pin.rpy.rpyToMatrix(0.0, 0.0, drive.yaw)
+        floor = choose_free_name("floor", self._get_names())
+        root = build_body_tree(self._file).links[0]
         self._file.root.insert(0, ElementTree.Element("link", name=floor))
-        joint = ElementTree.SubElement(
-            self._file.root, "joint", name=f"{floor}_joint", type="fixed"
-        )
-        ElementTree.SubElement(joint, "origin", xyz=f"0 0 {lift + raised:.6g}", rpy="0 0 0")
-        ElementTree.SubElement(joint, "parent", link=floor)
-        ElementTree.SubElement(joint, "child", link=root)
-        why = "it stands on its lowest point"
+        moved = pin.SE3(turn, place).inverse()
+        add_connection(self._file.root, f"{floor}_joint", "fixed", floor, root, moved)
         if raised:
             why = f"{1e3 * raised:.0f} mm of it keep all links of the arm clear of the floor"
-        self._guess(
-            "likely",
-            f"{root} is {lift + raised:.3f} m above the floor, the new root '{floor}': {why}",
-        )
+        if height:
+            text = f"{root} is {height:.3f} m above the floor, the new root '{floor}': {why}"
+            self._guess("likely", text)
+        if drive is not None and is_beside:
+            text = f"{describe_misplaced_axle(drive)}: the new root '{floor}' is there, "
+            self._guess("likely", f"{text}with x in the direction in which they roll")
         return self._write_and_load()
 
     def _find_home(self, robot: Robot, samples: int, seed: int) -> Home:
@@ -473,9 +500,10 @@ class _Importer:
             self._findings.append(Finding("note", "pairs", text))
             allowed[one, other] = "Near"
         checked, arm = set_collision_pairs(robot, allowed), robot.coordinates.names[3:]
+        states = self._source.srdf.find_states(arm, self._group)
         named = [
             (f"the state '{name}' of the file", find_arm_positions(robot, state))
-            for name, state in self._source.srdf.states.items()
+            for name, state in states.items()
             if set(arm) <= set(state)
         ]
         home = find_home(checked, [*named, ("joints at 0 or mid-range", robot.home)], seed=seed)
@@ -519,3 +547,17 @@ class _Importer:
                     f"{piece.link}: {what} ({hull}), protruding by {1e3 * piece.error:.0f} mm",
                 )
             )
+
+
+def _find_footprint(robot: Robot) -> tuple[str, float] | None:
+    """Return the link of the base that is on the floor by its name, and its height [m], or None.
+
+    A base_footprint is the point of a robot on the floor (REP 120 of ROS).
+    """
+    data = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, data, pin.neutral(robot.model))
+    for frame, place in zip(robot.model.frames, data.oMf, strict=True):
+        is_link = frame.type == pin.FrameType.BODY and frame.parentJoint == 1
+        if is_link and "footprint" in split_words(frame.name):
+            return frame.name, float(place.translation[2])
+    return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from vkc_pin.errors import InputError
@@ -13,7 +13,7 @@ from vkc_pin.importing.missing_meshes import replace_missing_meshes
 from vkc_pin.importing.parsers import expand_xacro, uses_xacro
 from vkc_pin.importing.robots.mjcf import convert_mjcf
 from vkc_pin.world.files.kinematic_tree import check_tree
-from vkc_pin.world.files.srdf import Srdf, read_groups, read_srdf
+from vkc_pin.world.files.srdf import Srdf, SrdfState, find_srdf, read_srdf
 from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.files.xml import parse_xml
 
@@ -30,8 +30,7 @@ class Source:
     Attributes:
         file: The URDF, with the path of the original file.
         kind: "URDF", "xacro" or "MJCF".
-        srdf: The SRDF beside it.
-        groups: Maps each group of the SRDF to its joints.
+        srdf: The SRDF beside it, after the states of the file itself.
         linkages: Configurations of closed linkages, see `ConvertedRobot`.
         notes: Changes and omissions.
         warnings: Changes that can make the robot's shape wrong.
@@ -39,8 +38,7 @@ class Source:
 
     file: UrdfFile
     kind: str
-    srdf: Srdf = field(default_factory=lambda: Srdf({}, {}))
-    groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    srdf: Srdf = field(default_factory=Srdf)
     linkages: Sequence[Sequence[Mapping[str, float]]] = ()
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
@@ -87,19 +85,20 @@ def read_source(
     )
     read = UrdfFile(file.resolve(), _format_xml(root), root, dict(packages))
     warnings = tuple(replaced)
-    srdf_path = srdf if srdf is not None else _find_srdf(file)
-    if srdf_path is None:
-        return Source(read, kind, Srdf({}, states), {}, linkages, tuple(notes), warnings)
-    try:
-        semantics = read_srdf(srdf_path, links=read.links)
-    except InputError:
-        if srdf is not None:
-            raise
-        notes.append(f"ignored {srdf_path.name} beside it, which names links of another robot")
-        return Source(read, kind, Srdf({}, states), {}, linkages, tuple(notes), warnings)
-    groups = {name: group.joints for name, group in read_groups(srdf_path, read.root).items()}
-    merged = Srdf(semantics.allowed, {**states, **semantics.states})
-    return Source(read, kind, merged, groups, linkages, tuple(notes), warnings)
+    own_states = tuple(SrdfState(name, "", state) for name, state in states.items())
+    semantics = Srdf()
+    srdf_path = srdf if srdf is not None else find_srdf(file)
+    if srdf_path is not None:
+        try:
+            semantics = read_srdf(srdf_path, read.root)
+        except InputError as error:
+            if srdf is not None:
+                raise
+            because = error.problem if error.got is None else f"{error.problem} ({error.got})"
+            notes.append(f"ignored {srdf_path.name} beside it: {because}")
+        notes += [f"{srdf_path.name}: {note}" for note in semantics.notes]
+    merged = replace(semantics, states=(*own_states, *semantics.states))
+    return Source(read, kind, merged, linkages, tuple(notes), warnings)
 
 
 def choose_free_name(name: str, taken: set[str]) -> str:
@@ -127,15 +126,3 @@ def _complete_limits(root: ElementTree.Element) -> list[str]:
 
 def _format_xml(root: ElementTree.Element) -> str:
     return ElementTree.tostring(root, encoding="unicode")
-
-
-def _find_srdf(file: Path) -> Path | None:
-    """Return the SRDF that belongs to a file by its name, or None."""
-    name = file.name.split(".")[0]
-    stems = dict.fromkeys((name, name.removesuffix("_robot")))
-    places = [
-        folder / f"{stem}.srdf"
-        for stem in stems
-        for folder in (file.parent, file.parent.parent / "srdf")
-    ]
-    return next((place for place in places if place.is_file()), None)

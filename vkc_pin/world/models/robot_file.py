@@ -16,12 +16,13 @@ from vkc_pin.utils.arguments import check_coordinate, check_mapping, check_text
 from vkc_pin.world.files import resources
 from vkc_pin.world.files.documents import Document
 from vkc_pin.world.files.resources import check_path
-from vkc_pin.world.files.srdf import Srdf, find_group_tip, read_srdf
+from vkc_pin.world.files.srdf import Srdf, find_srdf, read_srdf
 from vkc_pin.world.files.urdf import UrdfFile, read_urdf
-from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.couplings import (
     apply_couplings,
     apply_robot_limits,
+    find_followers,
+    find_joint_path,
     tighten_coupled_limits,
 )
 from vkc_pin.world.models.gripper import build_gripper
@@ -44,6 +45,7 @@ from vkc_pin.world.models.robot_schema import (
 )
 from vkc_pin.world.models.self_collisions import apply_self_collision_analysis, set_collision_pairs
 from vkc_pin.world.models.shapes import LIMIT_SLACK
+from vkc_pin.world.models.wheels import describe_misplaced_axle, find_drive, is_on_axle
 
 __all__ = ["find_robot", "find_robot_files", "list_robots", "load_robot"]
 
@@ -174,20 +176,20 @@ def load_robot(  # noqa: PLR0913 - keyword options of a public call
     )
     urdf, settings = files.urdf, files.settings
     srdf_path = check_path(srdf, "srdf") if srdf is not None else files.find_srdf()
-    semantics = (
-        read_srdf(srdf_path, links=urdf.links)
-        if srdf_path is not None and pairs == "srdf"
-        else None
-    )
+    group = files.find_group(arm, tool_frame)
+    semantics = files.read_semantics(srdf_path, pairs, group)
     full = build_full_model(urdf)
-    tool = (
-        tool_frame
-        if tool_frame is not None
-        else files.find_tool_frame(arm, srdf_path) or find_default_tool_frame(full, urdf)
-    )
+    tool = tool_frame
+    if tool is None:
+        tool = files.find_tool_frame(semantics, group, srdf_path)
+    if tool is None:
+        tool = find_default_tool_frame(full, urdf)
+    if pairs != "srdf":
+        semantics = None
     if tool not in (frames := dict.fromkeys(frame.name for frame in full.frames)):
         raise UnknownNameError("frame", tool, frames, file=urdf.path, field="tool_frame")
     full = tighten_coupled_limits(full, urdf, tool)
+    _warn_of_misplaced_axle(full, urdf, tool, base)
     base_joints = find_base_joints(full, urdf) if base != "fixed" else ()
     fingers = {joint: finger.open for joint, finger in settings.gripper.items()}
     stated_positions = {**settings.locked_joints, **locked_joints}
@@ -212,8 +214,9 @@ def load_robot(  # noqa: PLR0913 - keyword options of a public call
     coordinates, lower, upper, velocity, acceleration = apply_robot_limits(
         full, model, settings, base
     )
-    files.check_followers(model, rest, known_positions)
-    state = _read_rest_state(model, coordinates.names[3:], semantics, known_positions)
+    given = dict.fromkeys((*settings.home, *home), "home")
+    files.check_followers(rest, given | dict.fromkeys(stated_positions, "locked_joints"))
+    state = _read_rest_state(model, coordinates.names[3:], semantics, group, known_positions)
     collision = load_collision_geometry(model, urdf)
     robot = Robot(
         name=files.name,
@@ -255,13 +258,7 @@ def load_robot(  # noqa: PLR0913 - keyword options of a public call
             if joint not in known_positions and joint not in state
         ]
         robot = apply_self_collision_analysis(robot, semantics, loose_joints, samples=_SAMPLES)
-    if len(robot.collision.collisionPairs) == 0 and (pairs == "all" or semantics is not None):
-        expected = "<collision> elements, and an SRDF that leaves some pairs"
-        raise InputError(
-            "no pair of links is left to check for self-collision",
-            file=robot.urdf,
-            expected=expected,
-        )
+    _check_pairs_left(robot, pairs, semantics)
     return robot
 
 
@@ -328,23 +325,37 @@ class _RobotFiles:
         """Return the path of the SRDF named in robot.yaml, or of one beside the URDF, or None."""
         if self.settings.srdf is not None:
             return self.source.parent / self.settings.srdf
-        path = self.urdf.path
-        stems = (path.stem, path.stem.removesuffix("_robot"))
-        places = [
-            folder / f"{stem}.srdf"
-            for stem in stems
-            for folder in (path.parent, path.parent.parent / "srdf")
-        ]
-        return next((place for place in places if place.is_file()), None)
+        return find_srdf(self.urdf.path)
 
-    def find_tool_frame(self, arm: str | None, srdf: Path | None) -> str | None:
-        """Return the tool frame named by a group of the SRDF or by robot.yaml, or None."""
-        group = self.settings.arm if arm is None else arm
-        return (
-            self.settings.tool_frame
-            if group is None
-            else find_group_tip(srdf, self.urdf.root, group)
-        )
+    def find_group(self, arm: str | None, tool_frame: str | None) -> str | None:
+        """Return the group of the SRDF that is planned: that of an argument or of robot.yaml."""
+        if arm is not None or tool_frame is not None:
+            return arm
+        return self.settings.arm
+
+    def read_semantics(self, srdf: Path | None, pairs: str, group: str | None) -> Srdf | None:
+        """Return the SRDF if its pairs or groups are needed; warn of what it names in vain."""
+        if srdf is None or (pairs != "srdf" and group is None):
+            return None
+        semantics = read_srdf(srdf, self.urdf.root)
+        for note in semantics.notes:
+            warnings.warn(f"{srdf}: {note}", stacklevel=3)
+        return semantics
+
+    def find_tool_frame(
+        self, semantics: Srdf | None, group: str | None, srdf: Path | None
+    ) -> str | None:
+        """Return the tip of the group that is planned, or the frame of robot.yaml, or None.
+
+        Raises:
+            UnknownNameError: There is no such group, or no SRDF.
+        """
+        if group is None:
+            return self.settings.tool_frame
+        groups = {} if semantics is None else semantics.groups
+        if group not in groups:
+            raise UnknownNameError("group of an SRDF", group, groups, file=srdf, field="arm")
+        return groups[group].tip
 
     def check_names(self, joints: Collection[str]) -> None:
         """Check that the joints and links named in robot.yaml exist."""
@@ -373,25 +384,25 @@ class _RobotFiles:
                 raise self.document.make_error((key, joint), problem, **details)
         raise InputError(problem, file=self.urdf.path, field=f"{field}.{joint}", **details)
 
-    def check_followers(
-        self, model: pin.Model, rest: Mapping[str, float], known_positions: Collection[str]
-    ) -> None:
-        """Check that given home positions agree with the couplings of joints."""
-        coordinates = Coordinates(model)
-        for move in coordinates.moves[3:]:
-            joint, leader = str(model.names[move.joint]), coordinates.names[move.coordinate]
-            if joint != leader and joint in known_positions:
-                follows = move.factor * rest[leader] + move.offset
-                if abs(rest[joint] - follows) > LIMIT_SLACK:
-                    problem = f"this joint follows '{leader}'"
-                    details: dict[str, Any] = {
-                        "expected": f"{follows:g}, or no value",
-                        "got": rest[joint],
-                    }
-                    if joint in self.settings.home:
-                        raise self.document.make_error(("home", joint), problem, **details)
-                    field = f"home.{joint}"
-                    raise InputError(problem, file=self.urdf.path, field=field, **details)
+    def check_followers(self, rest: Mapping[str, float], given: Mapping[str, str]) -> None:
+        """Check that given positions of joints agree with the couplings of these joints.
+
+        Args:
+            rest: Position of each joint.
+            given: Joints whose position was given → field, "home" or "locked_joints".
+        """
+        for joint, coupling in find_followers(self.urdf.root).items():
+            if joint not in given or coupling.leader not in rest:
+                continue
+            follows = coupling.factor * rest[coupling.leader] + coupling.offset
+            if abs(rest[joint] - follows) <= LIMIT_SLACK:
+                continue
+            problem = f"this joint follows '{coupling.leader}'"
+            details: dict[str, Any] = {"expected": f"{follows:g}, or no value", "got": rest[joint]}
+            field = given[joint]
+            if joint in getattr(self.settings, field):
+                raise self.document.make_error((field, joint), problem, **details)
+            raise InputError(problem, file=self.urdf.path, field=f"{field}.{joint}", **details)
 
 
 def _read_files(name: str | Path, packages: Mapping[str, str | Path]) -> _RobotFiles:
@@ -423,11 +434,43 @@ def find_robot_files(name: str | Path) -> tuple[Path | None, Path | None]:
     return files.source if files.source.suffix == ".yaml" else None, files.find_srdf()
 
 
+def _check_pairs_left(robot: Robot, pairs: str, semantics: Srdf | None) -> None:
+    """Check that a pair of links is left to check for collision, unless none can collide."""
+    if len(robot.collision.collisionPairs):
+        return
+    if pairs != "all":
+        if semantics is None:
+            return
+        sampled = apply_self_collision_analysis(robot, None, (), samples=_SAMPLES)
+        if len(sampled.collision.collisionPairs) == 0:
+            return
+    raise InputError(
+        "no pair of links is left to check for self-collision",
+        file=robot.urdf,
+        expected="<collision> elements of several links, and an SRDF that leaves some pairs",
+    )
+
+
+def _warn_of_misplaced_axle(full: pin.Model, urdf: UrdfFile, tool: str, base: Base) -> None:
+    """Warn if wheels would slide sideways because the root is not on their axle."""
+    if base not in ("differential", "ackermann"):
+        return
+    path = [str(full.names[joint]) for joint in find_joint_path(full, tool)]
+    drive = find_drive(full, urdf, path)
+    if drive is not None and not is_on_axle(drive):
+        text = f"{urdf.path}: {describe_misplaced_axle(drive)}"
+        warnings.warn(f"{text}: its wheels will slide sideways (see docs/robots.md)", stacklevel=3)
+
+
 def _read_rest_state(
-    model: pin.Model, arm: Sequence[str], semantics: Srdf | None, known_positions: Collection[str]
+    model: pin.Model,
+    arm: Sequence[str],
+    semantics: Srdf | None,
+    group: str | None,
+    known_positions: Collection[str],
 ) -> dict[str, float]:
     """Return the home positions of an arm's joints in an SRDF, without those already known."""
-    state = {} if semantics is None else semantics.state(arm)
+    state = {} if semantics is None else semantics.find_home(arm, group)
     return {
         joint: find_nearest_position(model, joint, state[joint])
         for joint in arm

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .plan import NotJudged
 from .poses import make_pose
 from .supports import compute_distance
 
@@ -60,6 +61,8 @@ class Neighbours:
         for item in self.world.plan.scene.get("allow") or ():
             if item.get("srdf"):
                 root = ElementTree.parse(self.world.plan.folder / item["srdf"]).getroot()
+                if root.find("disable_default_collisions") is not None:
+                    raise NotJudged("an SRDF with defaults of links")
                 pairs += [
                     (pair.get("link1"), pair.get("link2"), -np.inf)
                     for pair in root.iter("disable_collisions")
@@ -73,6 +76,8 @@ class Neighbours:
         """Return the clearance that a scene sets for two shapes; infinite by default."""
 
         def matches(name: str, part: Solid) -> bool:
+            if part.owner in self.world.objects and part.label == f"{part.owner}.{name}":
+                return True  # as an SRDF names links
             return part.label == name or (part.owner == name and name in self.world.objects)
 
         return min(

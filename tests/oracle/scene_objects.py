@@ -385,6 +385,8 @@ def load_robot(
     semantics = _read_srdf(urdf.path, file.parent, settings.get("srdf"))
     if semantics is None:
         raise NotJudged("no SRDF lists the links of the robot that may touch")
+    if semantics.find("disable_default_collisions") is not None:
+        raise NotJudged("an SRDF with defaults of links")
     base, joints = settings.get("base") or {}, settings.get("joints") or {}
     height = float(base.get("height", 0.0)) if height is None else height
     velocities, accelerations = (

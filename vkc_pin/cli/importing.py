@@ -73,6 +73,8 @@ def add_importing(commands: Any) -> None:
     _add_output(home, "import-home")
     about = "height of the floor in the file (default 0)"
     add_option(home, "--floor METRES", about, type=float, default=0.0)
+    about = "an SRDF with pairs of links that may touch (default: the one beside the file)"
+    add_option(home, "--srdf FILE", about)
     _add_packages(home)
     _add_hand(home, most=2)
     add_seed(home, "random seed of the search for a start pose (default 0)")
@@ -196,6 +198,7 @@ def _import_home(arguments: argparse.Namespace) -> int:
             most=arguments.most,
             seed=arguments.seed,
             force=arguments.force,
+            srdf=arguments.srdf,
             **_read_packages(arguments),
         )
     sys.stdout.write(f"{done.summary()}\nwrote {done.file}\n")

@@ -73,13 +73,15 @@ def test_primitive_shapes_are_kept_and_meshes_become_urdf(tmp_path: Path) -> Non
     ball = Link("a wall", (), (make_part("sphere", (0.2,), placement),))
     home = Home((building,), (mesh, ball), (), (), 4, ())
     taken = {"ball", "wedge"}
-    entries, notes = write_obstacles(
+    entries, links, notes = write_obstacles(
         home, tmp_path / "home.urdf", tmp_path, taken, {}, ImportProgress(home)
     )
     assert [entry["name"] for entry in entries] == ["a_wall", "walls_1", "wedge_2", "a_wall_2"]
     assert [entry["type"] for entry in entries] == ["box", "capsule", "urdf", "sphere"]
     assert entries[0]["colour"] == list(red)
     assert taken == {"ball", "wedge", "a_wall", "walls_1", "wedge_2", "a_wall_2"}
+    assert list(links.values()) == ["walls", "walls", "wedge", "a wall"]
+    assert list(links) == [entry["name"] for entry in entries]
     assert not notes
     document = {"robot": "husky_ur5e", "start": {"base": [-3, -3, 0]}, "floor": False}
     scene = vkc.Scene.from_document({**document, "obstacles": entries}, tmp_path)

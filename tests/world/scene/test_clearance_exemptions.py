@@ -153,6 +153,41 @@ def test_allowed_pairs_raise_no_warning(tmp_path: Path, allow: list[Any], margin
 
 
 @pytest.mark.parametrize(
+    ("elements", "pairs"),
+    [
+        ('<disable_collisions link1="panel" link2="wall_0"/>', {("door.panel", "wall_0")}),
+        ('<disable_collisions link1="panel" link2="base_link"/>', {("base_link", "door.panel")}),
+    ],
+)
+def test_srdf_names_links_without_their_object(
+    tmp_path: Path, elements: str, pairs: set[tuple[str, str]]
+) -> None:
+    (tmp_path / "home.srdf").write_text(f"<robot>{elements}</robot>")
+    scene = make_wall_scene(0.004, folder=tmp_path, allow=["home.srdf"])
+    assert set(scene.allowed) == {frozenset(pair) for pair in pairs}
+
+
+def test_default_of_an_obstacle_does_not_concern_the_robot(tmp_path: Path) -> None:
+    (tmp_path / "home.srdf").write_text(
+        '<robot><disable_default_collisions link="wall_0"/>'
+        '<enable_collisions link1="wall_0" link2="floor"/></robot>'
+    )
+    scene = make_wall_scene(0.004, folder=tmp_path, allow=["home.srdf"])
+    links = {f"door.{link}" for link in scene.objects["door"].object.links}
+    assert set(scene.allowed) == {frozenset(("wall_0", other)) for other in {*links, "other"}}
+
+
+def test_stale_names_of_an_srdf_are_warned_of(tmp_path: Path) -> None:
+    pairs = "".join(
+        f'<disable_collisions link1="panel" link2="{name}"/>' for name in ("wall_0", "gone")
+    )
+    (tmp_path / "home.srdf").write_text(f"<robot>{pairs}</robot>")
+    with pytest.warns(UserWarning, match=r"home\.srdf: skipped pairs of links .*: gone"):
+        scene = make_wall_scene(0.004, folder=tmp_path, allow=["home.srdf"])
+    assert scene.allowed.keys() == {frozenset(("door.panel", "wall_0"))}
+
+
+@pytest.mark.parametrize(
     ("allow", "field", "message"),
     [
         ([["door.panle", "wall_0"]], "allow[0][0]", "did you mean 'door.panel'"),

@@ -14,6 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
+from vkc_pin.importing.homes.allowed_contacts import read_home_contacts
 from vkc_pin.importing.homes.splitting import FLOOR_RISE, Home, add_floor, split_home
 from vkc_pin.importing.homes.writing import (
     ImportedHomeObject,
@@ -92,7 +93,7 @@ class ImportedHome:
         )
 
 
-def import_home(
+def import_home(  # noqa: PLR0913 - keyword options of a public call
     file: str | Path,
     folder: str | Path | None = None,
     *,
@@ -102,6 +103,7 @@ def import_home(
     most: int = 2,
     seed: int = 0,
     force: bool = False,
+    srdf: str | Path | None = None,
     packages: Mapping[str, str | Path] | None = None,
     arguments: Mapping[str, str] | None = None,
 ) -> ImportedHome:
@@ -121,6 +123,8 @@ def import_home(
         most: Largest number of attachments of one joint.
         seed: Random seed of the search for a start pose.
         force: Whether to replace a folder that an earlier import wrote.
+        srdf: An SRDF whose pairs of links may touch; defaults to the one beside the file or in
+            ../srdf.
         packages: Folders of packages by name; others are searched for around the file.
         arguments: Arguments of a xacro file.
 
@@ -139,10 +143,11 @@ def import_home(
         check_path(folder, "folder", "a folder") if folder is not None else Path(_choose_name(path))
     )
     check_target(target, _COMMAND, force=check_bool(force, "force"))
-    description = read_description(path, free=True, packages=packages, arguments=arguments)
-    description = move_root(
-        rename_for_scenes(description), pin.SE3(np.eye(3), np.array([0.0, 0.0, -floor]))
-    )
+    srdf_path = None if srdf is None else check_path(srdf, "srdf")
+    original = read_description(path, free=True, packages=packages, arguments=arguments)
+    description = rename_for_scenes(original)
+    contacts = read_home_contacts(path, srdf_path, original.links, description.links)
+    description = move_root(description, pin.SE3(np.eye(3), np.array([0.0, 0.0, -floor])))
     low, high = compute_bounds(description, load_surfaces(description))
     home = split_home(description)
     if not home.objects:
@@ -169,7 +174,10 @@ def import_home(
                 progress.follow(home.objects), choose_file_names(names), strict=True
             )
         )
-        obstacles, obstacle_notes = write_obstacles(home, path, staging, taken, cache, progress)
+        obstacles, obstacle_links, obstacle_notes = write_obstacles(
+            home, path, staging, taken, cache, progress
+        )
+        allowed, contact_notes = contacts.find_scene_pairs(home, obstacle_links)
         bounds, (low, high) = (low, high), add_floor(home, low, high)
         document: dict[str, Any] = {
             "name": _choose_name(path),
@@ -179,6 +187,7 @@ def import_home(
             "start_region": {axis: _round_interval(low[k], high[k]) for k, axis in enumerate("xy")},
             "obstacles": obstacles,
             "objects": [item.entry for item in objects],
+            **({"allow": allowed} if allowed else {}),
         }
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # they are repeated when the scene is loaded
@@ -193,6 +202,8 @@ def import_home(
         *_note_floor_shapes(home),
         *_note_open_sides(bounds, (low, high)),
         *_note_high_objects(scene, rng),
+        *contacts.notes,
+        *contact_notes,
         *obstacle_notes,
         *(f"{item.name}: {note}" for item in objects for note in item.notes),
     )

@@ -184,15 +184,20 @@ def write_obstacles(
     taken: set[str],
     cache: PieceCache,
     progress: ImportProgress,
-) -> tuple[list[dict[str, Any]], list[str]]:
-    """Write the fixed parts of a home, and return the scene's obstacle entries and notes.
+) -> tuple[list[dict[str, Any]], dict[str, str], list[str]]:
+    """Write the fixed parts of a home, and return the scene's obstacle entries, links and notes.
 
     Each piece of furniture is one obstacle, so that reports name it; so is each shape of the
     building. Primitive shapes are written into the scene itself. Others become a URDF with convex
-    pieces, whose origin is on the floor below its centre.
+    pieces, whose origin is on the floor below its centre. Links are those of the file, by the name
+    of the obstacle.
     """
     entries, notes = list[dict[str, Any]](), list[str]()
-    named = {choose_name(link.name, taken): link for link in _iterate_obstacle_links(home)}
+    named, sources = dict[str, Link](), dict[str, str]()
+    for source_link, link in _iterate_obstacle_links(home):
+        name = choose_name(link.name, taken)
+        named[name] = link
+        sources[name] = source_link
     written = [name for name, link in named.items() if not _is_simple(link)]
     stems = dict(zip(written, choose_file_names(written), strict=True))
     for name, link in zip(named, progress.follow(named.values()), strict=True):
@@ -210,18 +215,19 @@ def write_obstacles(
         entries.append(
             {"name": name, "type": "urdf", "file": address, "position": round_values(origin)}
         )
-    return entries, notes
+    return entries, sources, notes
 
 
-def _iterate_obstacle_links(home: Home) -> Iterator[Link]:
-    """Yield the links that become one obstacle each."""
+def _iterate_obstacle_links(home: Home) -> Iterator[tuple[str, Link]]:
+    """Yield the links that become one obstacle each, after their link in the file."""
     for link in home.building:
         for number, part in enumerate(link.solid):
             colour = _find_colour(part, link.visual)
             shapes = (dataclasses.replace(part, colour=colour),)
             name = link.name if len(link.solid) == 1 else f"{link.name}_{number}"
-            yield Link(part.name or name, shapes, shapes)
-    yield from home.furniture
+            yield link.name, Link(part.name or name, shapes, shapes)
+    for link in home.furniture:
+        yield link.name, link
 
 
 def _is_simple(link: Link) -> bool:

@@ -5,19 +5,20 @@ from __future__ import annotations
 import contextlib
 import functools
 import itertools
-from collections.abc import Iterable, Mapping
+import warnings
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.errors import find_nearest_name
+from vkc_pin.errors import UnknownNameError, find_nearest_name
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.pickling import freeze
 from vkc_pin.world.files.documents import Document, parse_document
 from vkc_pin.world.files.resources import check_path
-from vkc_pin.world.files.srdf import read_srdf
+from vkc_pin.world.files.srdf import format_names, read_allowed_pairs
 from vkc_pin.world.models.grafting import round_placement
 from vkc_pin.world.models.object_file import build_object, load_object
 from vkc_pin.world.models.robot import Robot
@@ -286,36 +287,73 @@ def _find_allowed_pairs(
     objects: Mapping[str, PlacedObject],
 ) -> dict[frozenset[str], float]:
     """Return pairs of link labels that may be close → margin [m]; the smallest of several."""
-    labels = {link: [link] for link in robot.links}
+    robot_labels = {link: [link] for link in robot.links}
+    labels = dict(robot_labels)
+    links = dict[str, list[str]]()  # labels by the name of the link alone
     for name, placed in objects.items():
         own = [f"{name}.{link}" for link in placed.object.links]
         labels |= {label: [label] for label in own} | {name: own}
+        for link, label in zip(placed.object.links, own, strict=True):
+            links.setdefault(link, []).append(label)
     labels |= {item.name: [item.name] for item in description.obstacles} | (
         {FLOOR: [FLOOR]} if description.floor else {}
     )
+    # In an SRDF, the name of a link stands for it without its object if it is the only one.
+    labels_in_srdf = dict(labels)
+    for link, found_labels in links.items():
+        if len(found_labels) == 1 and (link not in labels or link in objects):
+            labels_in_srdf[link] = found_labels
+    models = [list(robot_labels), [name for name in labels_in_srdf if name not in robot_labels]]
     found: dict[frozenset[str], float] = {}
     for number, item in enumerate(description.allow):
         pairs: Iterable[tuple[str, ...]] = [item.pair] if item.pair is not None else []
+        names = labels
         if item.srdf is not None:
             is_short = isinstance(document.data["allow"][number], str)
             file = _find_file(
                 document, ("allow", number, *(() if is_short else ("srdf",))), folder, item.srdf
             )
-            pairs = read_srdf(file, links=labels).allowed
+            pairs = _read_allowed_pairs(file, models)
+            names = labels_in_srdf
         for pair in pairs:
             for place, name in enumerate(pair):
-                if name not in labels:
+                if name not in names:
                     is_short = isinstance(document.data["allow"][number], list | tuple)
                     raise document.make_unknown_name_error(
                         ("allow", number, *(() if is_short else ("pair",)), place),
                         "link, object or obstacle",
                         name,
-                        labels,
+                        names,
                     )
             margin = -np.inf if item.margin is None else item.margin
-            for both in itertools.product(*(labels[name] for name in pair)):
+            for both in itertools.product(*(names[name] for name in pair)):
                 found[frozenset(both)] = min(margin, found.get(frozenset(both), np.inf))
     return found
+
+
+def _read_allowed_pairs(file: Path, models: Sequence[Collection[str]]) -> Iterable[tuple[str, str]]:
+    """Return the allowed pairs of an SRDF; warn of names that the scene does not have.
+
+    Args:
+        file: The SRDF.
+        models: Names of the robot's links, and of the other links.
+    """
+    pairs = read_allowed_pairs(file, models)
+    if pairs.unknown and not pairs.allowed:
+        name, line = next(iter(pairs.unknown.items()))
+        known = [label for model in models for label in model]
+        raise UnknownNameError(
+            "link, object or obstacle",
+            name,
+            known,
+            file=file,
+            line=line,
+            field="disable_collisions",
+        )
+    if pairs.unknown:
+        text = f"skipped pairs of links that the scene does not have: {format_names(pairs.unknown)}"
+        warnings.warn(f"{file}: {text}", stacklevel=2)
+    return pairs.allowed
 
 
 def _make_pose(item: schema.PoseSchema) -> pin.SE3:

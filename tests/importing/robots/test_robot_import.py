@@ -154,7 +154,7 @@ def test_folder_is_replaced_only_with_force_and_kept_on_failure(tmp_path: Path) 
     [
         ("<sdf/>", r"expected <robot> \(URDF or xacro\) or <mujoco> \(MJCF\), got <sdf>"),
         ("<robot name='x'><link name='a'/></robot>", "the robot has no shapes"),
-        ("not xml", "not valid XML"),
+        ("not xml", "the file is not XML"),
     ],
 )
 def test_errors_name_the_problem_of_an_invalid_robot(

@@ -341,19 +341,34 @@ def _find_collision(problem: TrajectoryProblem, phase: Phase, coordinate: str) -
     begin = phase.initial_values[coordinate]
     end = float(np.clip(phase.values[coordinate], *problem.limits(coordinate)))
     values = np.linspace(begin, end, _SAMPLES)
-    fixed = {owner: one for owner, one in scene.objects.items() if not one.object.free}
-    shapes = PlacedShapes(scene, fixed)
+    # Objects that no hand moves are where the scene has them; of others only the fixed links are.
+    task = problem.task
+    moved = {hold.object for hold in task.holds} | {one.object for one in task.supported}
+    objects = {
+        owner: one
+        for owner, one in scene.objects.items()
+        if owner not in moved or not one.object.free
+    }
+    shapes = PlacedShapes(scene, objects)
     exemptions = find_clearance_exemptions(scene, problem.options.dist_safe)
     links = {
         f"{owner}.{link}": shapes.find_joints(f"{owner}.{link}")
-        for owner, one in fixed.items()
+        for owner, one in objects.items()
         for link in one.object.links
     }
     swept = [f"{name}.{link}" for link in placed.object.links if links[f"{name}.{link}"] == [joint]]
-    others = {
-        label for label, joints in links.items() if not joints and label.partition(".")[0] != name
+    others = set(scene.obstacle_labels) - {FLOOR}
+    for label, joints in links.items():
+        owner = label.partition(".")[0]
+        if owner != name and (owner not in moved or not joints):
+            others.add(label)
+    states = {
+        f"{owner}.{own_joint}": np.full(_SAMPLES, value)
+        for owner, one in objects.items()
+        for own_joint, value in zip(one.object.coordinates.names, one.state, strict=True)
     }
-    others |= set(scene.obstacle_labels) - {FLOOR}
+    states[coordinate] = values
+    names, rows = list(states), np.column_stack(list(states.values()))
     deepest, text = -_CERTAIN_OVERLAP, ""
     index = placed.object.coordinates.index(joint)
     for label in swept:
@@ -363,7 +378,7 @@ def _find_collision(problem: TrajectoryProblem, phase: Phase, coordinate: str) -
             for one in exemptions:
                 if not one.is_between(label, other):
                     continue
-                is_active = one.is_active([coordinate], values[:, None])
+                is_active = one.is_active(names, rows)
                 pairs = set(one.find_shape_pairs(shapes.labels, shapes.keys))
                 for k, j in itertools.product(range(len(own)), range(len(hit))):
                     if (min(own[k], hit[j]), max(own[k], hit[j])) in pairs:

@@ -3,7 +3,9 @@
 Neighbours are a shape of an articulated object and a shape of another object or obstacle that are
 closer than the clearance, at the start or with all joints at zero. They need no clearance while
 each of their joints is in the interval in which it alone keeps them that close. Neighbours that
-overlap initially may overlap there, up to the largest penetration that a single joint causes.
+overlap at the start may overlap as much later, and by an error of the model at least. A leaf with
+its hinge inside the other shape may penetrate it further, by its thickness. An overlap with all
+joints at zero alone is an error of the model if it is small. Otherwise the pair is not exempt.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ __all__ = ["Neighbours"]
 
 SLACK = 1e-3  # [m] of the clearance
 ROUNDING = 1e-4  # [m] of penetration
+MODEL_ERROR = 0.005  # [m] of penetration; kitchens of other packages have up to 0.004
 VALUES = 150  # of a joint between its state and a limit
 
 
@@ -52,8 +55,8 @@ class Neighbours:
             for name, obj in self.fixed.items()
         }
         self.pairs = [
-            *self._find_pairs({name: obj.state for name, obj in self.fixed.items()}),
-            *self._find_pairs(zeros),
+            *self._find_pairs({name: obj.state for name, obj in self.fixed.items()}, at_start=True),
+            *self._find_pairs(zeros, at_start=False),
         ]
 
     def _read_allowed_pairs(self) -> list[tuple[str, str, float]]:
@@ -111,7 +114,7 @@ class Neighbours:
                 depth = np.maximum(depth, np.where(inside, pair.depth, 0.0))
         return close, depth
 
-    def _find_pairs(self, state: dict[str, dict[str, float]]) -> list[Pair]:
+    def _find_pairs(self, state: dict[str, dict[str, float]], *, at_start: bool) -> list[Pair]:
         """Return the close pairs in a state of the objects' joints."""
         links = {
             name: obj.tree.compute_links(state[name], None, obj.tree.urdf.links)
@@ -151,28 +154,32 @@ class Neighbours:
                 distance = self._compute_distance(
                     (shape, placement), (other_shape, other_placement)
                 )
-                if distance < self.clearance - SLACK:
-                    ranges, max_depth = {}, max(0.0, -distance)
+                is_model_error = distance >= -MODEL_ERROR
+                if distance < self.clearance - SLACK and (at_start or is_model_error):
+                    ranges, turns_inside, sides = {}, True, []
                     for (moving_label, moving_shape), (_, fixed_shape, fixed_placement) in (
                         ((label, shape), (other, other_shape, other_placement)),
                         ((other, other_shape), (label, shape, placement)),
                     ):
                         owner = moving_label.partition(".")[0]
-                        for joint in self._find_joints(moving_label):
-                            interval, depth_of_joint = self._find_joint_range(
+                        joints = self._find_joints(moving_label)
+                        for joint in joints:
+                            interval, always_overlaps = self._find_joint_range(
                                 moving_label,
                                 moving_shape,
                                 joint,
                                 state[owner],
                                 (fixed_shape, fixed_placement),
                             )
-                            ranges[f"{owner}.{joint}"], max_depth = (
-                                interval,
-                                max(max_depth, depth_of_joint),
-                            )
-                    depth = (
-                        0.0 if distance > -ROUNDING else np.inf if len(ranges) == 1 else max_depth
-                    )
+                            ranges[f"{owner}.{joint}"] = interval
+                            kind = self.fixed[owner].tree.urdf.get_joint_type(joint)
+                            turns_inside &= always_overlaps and kind != "prismatic"
+                        sides += [2.0 * float(moving_shape.half.min())] if joints else []
+                    depth = 0.0
+                    if distance < -ROUNDING:
+                        depth = max(MODEL_ERROR, -distance)
+                    if distance < -ROUNDING and at_start and turns_inside:
+                        depth = max(MODEL_ERROR, -distance + min(sides))
                     pairs.append(Pair(shapes, depth, ranges))
         return pairs
 
@@ -206,10 +213,13 @@ class Neighbours:
         joint: str,
         state: dict[str, float],
         other: tuple[Shape, Poses],
-    ) -> tuple[tuple[float, float], float]:
-        """Return the joint interval in which a shape violates the clearance, and its depth."""
+    ) -> tuple[tuple[float, float], bool]:
+        """Return the joint interval in which a shape violates the clearance.
+
+        Also return whether it overlaps the other shape at every value of the joint.
+        """
         owner, _, link = label.partition(".")
-        obj, max_depth = self.fixed[owner], 0.0
+        obj, always_overlaps = self.fixed[owner], True
 
         def compute_distances(values: np.ndarray) -> np.ndarray:
             placement = (
@@ -228,11 +238,7 @@ class Neighbours:
             )
             distances = compute_distances(values)
             beyond = np.flatnonzero(distances >= self.clearance)
-            inside = distances[: beyond[0]] if len(beyond) else distances
-            if len(inside) and inside.min() < 0.0:
-                k = int(np.argmin(inside))
-                around = np.linspace(values[max(k - 1, 0)], values[min(k + 1, VALUES - 1)], VALUES)
-                max_depth = max(max_depth, float(-compute_distances(around).min()))
+            always_overlaps &= bool((distances < -ROUNDING).all())
             if not len(beyond):
                 ends.append(sign * np.inf)
                 continue
@@ -245,4 +251,4 @@ class Neighbours:
                     else (middle, far)
                 )
             ends.append(float(far))
-        return (ends[0], ends[1]), max_depth
+        return (ends[0], ends[1]), always_overlaps

@@ -205,7 +205,7 @@ def test_carried_object_may_be_close_to_its_supports() -> None:
             [],
             (2, 6, 0.0, CONTACT_DEPTH, False, True),
         ),  # until the front, 18 mm thick, is √(20² - 5²) mm past it
-        (-0.002, [], (2, 6, -np.inf, np.inf, True, True)),
+        (-0.002, [], (2, 6, -0.005, CONTACT_DEPTH + 0.005, False, True)),
         (
             -0.002,
             [{"pair": ["drawer.tray", "side"], "margin": -0.003}],

@@ -12,11 +12,11 @@ from vkc_pin.options import Options
 from vkc_pin.utils.arrays import Ints
 from vkc_pin.validation.distances import CollisionShapes
 from vkc_pin.validation.goals import MOTION_TOLERANCE, make_hold
+from vkc_pin.validation.neighbours import ExemptPairs, find_exempt_pairs
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.tolerances import Tolerances
 from vkc_pin.world.models.gripper import WIDTH_TOLERANCE
-from vkc_pin.world.scene.clearance_exemptions import ClearanceExemption, find_clearance_exemptions
 from vkc_pin.world.scene.contact_rules import (
     CONTACT_DEPTH,
     CONTACT_WINDOW,
@@ -161,7 +161,7 @@ class _WindowFinder:
         self.tolerances = tolerances
         self.samples, self.solids, self.options = samples, solids, options
         self.scene, self.trajectory, world = samples.scene, samples.trajectory, samples.world
-        self.labels, self.keys = np.array(world.collision_labels), world.collision_keys
+        self.labels = np.array(world.collision_labels)
         self.q = world.coordinates.q(samples.z[samples.waypoint_rows])
         low, high = samples.ranges
         # Freedoms of later grasps may change at rest.
@@ -171,7 +171,7 @@ class _WindowFinder:
         self.supports = samples.free_objects.supports
 
     def find(self, steps: Sequence[Step]) -> Iterator[Window]:
-        for one in find_clearance_exemptions(self.scene, self.options.dist_safe):
+        for one in find_exempt_pairs(self.scene, self.solids, self.options.dist_safe):
             yield from self._find_exemption_windows(one)
         holds = [set(phase.holds) for phase in self.trajectory.phases]
         for hold, first, last in self._find_spans([set(self.scene.holds), *holds]):
@@ -201,20 +201,17 @@ class _WindowFinder:
                 yield Window(pairs, phase.first, phase.last, -np.inf, moves_together=True)
         yield from self._find_touch_windows([step for step in steps if isinstance(step, Touch)])
 
-    def _find_exemption_windows(self, one: ClearanceExemption) -> Iterator[Window]:
-        """Yield windows of a clearance exemption: always, or while its joint ranges hold."""
-        pairs = np.array(one.find_shape_pairs(self.labels.tolist(), self.keys), int).reshape(-1, 2)
+    def _find_exemption_windows(self, one: ExemptPairs) -> Iterator[Window]:
+        """Yield windows of exempt pairs: always, or while their joint ranges hold."""
         count = len(self.steps) + 1
-        rows = self.samples.z[self.samples.waypoint_rows]
-        holds = one.is_active(self.samples.world.coordinates.names, rows)
+        holds = one.are_active(self.samples.z[self.samples.waypoint_rows])
         contact, together = CONTACT_DEPTH + max(0.0, -one.margin), one.margin == -np.inf
         for begin, end in (
             np.flatnonzero(np.diff(holds, prepend=False, append=False)).reshape(-1, 2).tolist()
         ):
-            if len(pairs):
-                yield Window(
-                    pairs, begin, min(end, count) - 1, one.margin, contact, together, is_exempt=True
-                )
+            if len(one.pairs):
+                last = min(end, count) - 1
+                yield Window(one.pairs, begin, last, one.margin, contact, together, is_exempt=True)
 
     def _find_hold_windows(
         self, hold: Hold, first: int | None, last: int | None

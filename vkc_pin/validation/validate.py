@@ -22,15 +22,12 @@ from vkc_pin.validation.contact_windows import check_gripper, check_pushes, find
 from vkc_pin.validation.distances import CollisionShapes
 from vkc_pin.validation.goals import MOTION_TOLERANCE, check_goals, check_steps
 from vkc_pin.validation.limits import MotorLoads, check_rates, check_rolling
+from vkc_pin.validation.neighbours import ExemptPairs, find_exempt_pairs
 from vkc_pin.validation.report import Exemption, Report, Violation
 from vkc_pin.validation.samples import MAX_SAMPLES, Samples
 from vkc_pin.validation.terms import check_terms
 from vkc_pin.validation.tolerances import Tolerances
-from vkc_pin.world.scene.clearance_exemptions import (
-    CONTACT_DEPTH,
-    ClearanceExemption,
-    find_clearance_exemptions,
-)
+from vkc_pin.world.scene.clearance_exemptions import ACCEPTED_SHORTFALL, CONTACT_DEPTH
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.scene.support import MAX_TILT, compute_tilt
 from vkc_pin.world.task.steps import Step, as_steps
@@ -44,7 +41,6 @@ START_TOLERANCE = 1e-9  # difference from the scene's start [m] or [rad]
 LIMIT_TOLERANCE = 1e-5  # excess over a position limit [m] or [rad]
 START_LIMIT_TOLERANCE = 1e-2  # accepted excess at the start, where the robot already is [m], [rad]
 LATCH_TOLERANCE = 1e-4
-WAYPOINT_TOLERANCE = 1e-3  # accepted shortfall of dist_safe at a waypoint [m]
 
 
 def validate(
@@ -323,21 +319,23 @@ def _check_clearance(
     robot is already there, but nothing may penetrate. The smallest distance of each phase [m] goes
     to `nearest`, and used exemptions to `exemptions`.
     """
-    names = samples.world.coordinates.names
     lasts = [phase.last for phase in samples.trajectory.phases]
-    exempt = _find_exempt_pairs(samples, options.dist_safe)
+    exempt = dict[tuple[int, int], list[ExemptPairs]]()
+    for one in find_exempt_pairs(samples.scene, pairs.solids, options.dist_safe):
+        for first, second in one.pairs.tolist():
+            exempt.setdefault((first, second), []).append(one)
     for hit in sweep(pairs, samples.z, samples.waypoint_rows):
         allowed = exempt.get(hit.shapes, ())
         # The exemption also covers the segment before it ends and the one after it begins.
-        active = [-one.margin for one in allowed if one.is_active(names, samples.z[[hit.row]])[0]]
-        tolerated = max([0.0, *active])
+        active = [one for one in allowed if one.are_active(samples.z[[hit.row]])[0]]
+        tolerated = max([0.0, *(-one.margin for one in active)])
         overlap = max(hit.contact, CONTACT_DEPTH + tolerated if tolerated > 0.0 else 0.0)
         if hit.margin > -np.inf and not tolerated > 0.0:
             phase = bisect.bisect_left(lasts, samples.find_waypoint(hit.row))
             nearest[phase] = min(nearest[phase], hit.distance)
         is_checked, millimetres = hit.at_waypoint and hit.row > 0, 1e3 * abs(hit.distance)
         margin = min(hit.margin, -tolerated) if tolerated > 0.0 else hit.margin
-        short = margin - WAYPOINT_TOLERANCE - hit.distance
+        short = margin - ACCEPTED_SHORTFALL - hit.distance
         if hit.distance < -overlap:
             kind, amount, detail = "penetration", -hit.distance, f"overlap by {millimetres:.1f} mm"
         elif is_checked and short > 0.0:
@@ -346,7 +344,7 @@ def _check_clearance(
             detail = f"are only {millimetres:.1f} mm apart, {required}"
         else:
             if hit.distance < -CONTACT_DEPTH or (
-                is_checked and hit.distance < hit.exempt_clearance - WAYPOINT_TOLERANCE
+                is_checked and hit.distance < hit.exempt_clearance - ACCEPTED_SHORTFALL
             ):
                 _record_exemption(exemptions, hit, allowed)
             continue
@@ -354,29 +352,13 @@ def _check_clearance(
         violations.append(samples.make_violation(kind, subject, amount, "m", detail, row=hit.row))
 
 
-def _find_exempt_pairs(
-    samples: Samples, dist_safe: float
-) -> dict[tuple[int, int], list[ClearanceExemption]]:
-    """Return the pairs of shapes that the scene exempts from clearance, with the reasons."""
-    world, found = samples.world, dict[tuple[int, int], list[ClearanceExemption]]()
-    for one in find_clearance_exemptions(samples.scene, dist_safe):
-        for pair in one.find_shape_pairs(world.collision_labels, world.collision_keys):
-            found.setdefault(pair, []).append(one)
-    return found
-
-
 def _record_exemption(
-    exemptions: dict[tuple[str, str], Exemption], hit: Hit, allowed: Sequence[ClearanceExemption]
+    exemptions: dict[tuple[str, str], Exemption], hit: Hit, allowed: Sequence[ExemptPairs]
 ) -> None:
     """Record the smallest distance of a pair that used its exemption."""
     known = exemptions.get((hit.first, hit.second))
     if known is not None and known.distance <= hit.distance:
         return
-    reason = "no deeper than the object at the start"
-    if allowed:
-        one = allowed[0]
-        side = "apart" if one.distance >= 0.0 else "inside each other"
-        built = f"{one} stand {abs(1e3 * one.distance):.1f} mm {side} as built"
-        reason = "the scene allows it" if one.shapes is None else built
+    reason = allowed[0].reason if allowed else "no deeper than the object at the start"
     subject = f"{hit.first} – {hit.second}"
     exemptions[hit.first, hit.second] = Exemption(subject, hit.distance, reason)

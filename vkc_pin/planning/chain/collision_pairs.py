@@ -487,9 +487,7 @@ class _PairBuilder:
             )
             if one.ranges and len(exempt_pairs) and resolved is not None:
                 margin = (
-                    one.margin
-                    if one.margin < 0.0
-                    else REDUCED_MARGIN_RATIO * max(one.distance, 0.0)
+                    one.margin if one.margin < 0.0 else REDUCED_MARGIN_RATIO * max(one.nearest, 0.0)
                 )
                 margin_regions.append(MarginRegion(exempt_pairs, margin, *resolved))
         return table[kept], margin_regions

@@ -16,8 +16,8 @@ The planner and the independent validation both implement these rules.
 - A supported object and its support are rigidly connected.
 - Shapes of articulated objects that are closer than `Options.dist_safe` to other fixed shapes, in
   the initial state or with all joints at zero, keep no clearance until their joints have moved them
-  that far apart. They may overlap only if they did so in that state, and no deeper than a single
-  joint takes them; see `clearance_exemptions`.
+  that far apart. They may overlap only as deep as in the initial state, or by a small error of the
+  model; see `clearance_exemptions`.
 - A free object that overlaps its surroundings where it is first lifted may leave them within
   `CONTACT_WINDOW`.
 - An object grasped at the start counts as lifted there: it may leave what it touches or overlaps

@@ -130,3 +130,34 @@ def test_planning_continues_from_the_end_scene() -> None:
     failed = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 9.0})])
     with pytest.raises(InputError, match="no success"):
         failed.end_scene()
+
+
+@pytest.mark.parametrize(
+    ("attachment", "required", "is_reached"),
+    [
+        # The closed hand is 5.3 mm from the cup's side, and its fingers 8.0 mm from the rest.
+        ("side", 0.0052, True),
+        ("side", 0.0058, True),
+        ("side", 0.0062, True),
+        ("side", 0.0065, False),
+        ("top", 0.0088, True),
+        ("top", 0.0092, False),
+        ("oblique", 0.0088, True),
+        ("oblique", 0.0092, False),
+    ],
+)
+def test_check_and_plan_demand_the_same_clearance(
+    attachment: str, required: float, is_reached: bool
+) -> None:
+    """A clearance that falls short by up to 1 mm is accepted by both, and by neither beyond."""
+    scene, options = vkc.load_scene("tray"), vkc.Options(grasp_clearance=required)
+    one = next(
+        one
+        for one in check_scene(scene, options=options).attachments
+        if (one.object, one.attachment) == ("cup", attachment)
+    )
+    plan = vkc.plan(scene, [vkc.Grasp("cup", attachment)], options=options)
+    assert plan.success == is_reached
+    assert (one.configuration is not None) == is_reached
+    assert ("are only" in one.because) != is_reached
+    assert any("are only" in note for note in plan.report.notes) != is_reached

@@ -20,6 +20,7 @@ from vkc_pin.utils.arguments import check_instance, check_integer
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.scene.clearance_exemptions import (
+    ACCEPTED_SHORTFALL,
     ClearanceExemption,
     ClosePair,
     find_clearance_exemptions,
@@ -253,7 +254,7 @@ def _find_grasp(problem: TrajectoryProblem, seed: int) -> dict[str, Any]:
         clearance = np.full(len(z), _FAR)
         full = contacts.margin >= safe
         np.minimum.at(clearance, contacts.waypoint[full], contacts.distance[full])
-        clearance[contacts.compute_shortfall(len(z)) > 0.0] = -np.inf
+        clearance[contacts.compute_shortfall(len(z)) > ACCEPTED_SHORTFALL] = -np.inf
         best = int(np.argmax(clearance))
         if clearance[best] > -np.inf:
             robot = problem.chain.robot.coordinates.size

@@ -45,6 +45,7 @@ from vkc_pin.utils.budget import (
 )
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
+from vkc_pin.world.scene.clearance_exemptions import ACCEPTED_SHORTFALL
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Task
 from vkc_pin.world.trajectory.formats.archives import PlanStatus
@@ -455,5 +456,5 @@ def _describe_shortfall(report: Report) -> list[str]:
 def _has_free_ends(problem: TrajectoryProblem, guess: InitialGuess) -> bool:
     """Return whether a guess is feasible at the ends of the phases."""
     contacts = problem.evaluate_contacts(guess.z, reach=problem.options.largest_margin)
-    free = contacts.compute_shortfall(problem.segments)[problem.ends - 1] <= 0.0
-    return bool(free.all()) and problem.pose_error(guess.z) < 1e-2
+    shortfall = contacts.compute_shortfall(problem.segments)[problem.ends - 1]
+    return bool((shortfall <= ACCEPTED_SHORTFALL).all()) and problem.pose_error(guess.z) < 1e-2

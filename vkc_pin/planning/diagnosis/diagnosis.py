@@ -8,14 +8,17 @@ from typing import NamedTuple
 import numpy as np
 
 from vkc_pin.errors import InputError
-from vkc_pin.planning.initialization.keyframes import compute_shortfall, sample_goal_configurations
+from vkc_pin.planning.initialization.keyframes import (
+    find_free_configurations,
+    sample_goal_configurations,
+)
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.solver.trust_region import CLEARANCE_TOLERANCE
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.tolerances import Tolerances
 from vkc_pin.world.models.shapes import LIMIT_SLACK
+from vkc_pin.world.scene.clearance_exemptions import ACCEPTED_SHORTFALL
 from vkc_pin.world.scene.contact_rules import CONTACT_DEPTH
 from vkc_pin.world.task.steps import Actuate
 
@@ -127,7 +130,7 @@ def diagnose_goal(problem: TrajectoryProblem, number: int, random_seed: int) -> 
         reached, np.full(len(reached), end), reach=problem.options.largest_margin
     )
     shortfall = contacts.compute_shortfall(len(reached))
-    if shortfall.min() <= CLEARANCE_TOLERANCE:
+    if shortfall.min() <= ACCEPTED_SHORTFALL:
         return None
     best = int(np.argmin(shortfall))
     worst = int(np.flatnonzero(contacts.waypoint == best)[0])
@@ -187,8 +190,10 @@ def _has_free_sample(
     problem: TrajectoryProblem, waypoint: int, samples: tuple[Floats, Floats] | None
 ) -> bool:
     """Return whether one of the samples reaches the goal of a waypoint without collision."""
-    z = np.zeros((0, problem.chain.size)) if samples is None else samples[0][samples[1] < TOLERANCE]
-    return bool(len(z) and compute_shortfall(problem, z, waypoint).min() <= CLEARANCE_TOLERANCE)
+    if samples is None:
+        return False
+    z, residual = samples
+    return bool(find_free_configurations(problem, z[residual < TOLERANCE], waypoint).any())
 
 
 def _sample_goal(

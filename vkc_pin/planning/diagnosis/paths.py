@@ -9,7 +9,10 @@ import numpy as np
 
 from vkc_pin.planning.base_paths.base_path import shortest_path
 from vkc_pin.planning.initialization.base_routes import BaseRoutes
-from vkc_pin.planning.initialization.keyframes import compute_shortfall, sample_goal_configurations
+from vkc_pin.planning.initialization.keyframes import (
+    find_free_configurations,
+    sample_goal_configurations,
+)
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
@@ -105,7 +108,7 @@ def _find_base_goals(
         samples = sample_goal_configurations(problem, end, rng)
         if samples is not None:
             z = samples[0][samples[1] < TOLERANCE]
-            free = z[compute_shortfall(problem, z, end) <= 0.0] if len(z) else z
+            free = z[find_free_configurations(problem, z, end)]
             if len(free):
                 return free[:, :3], f"any of {len(free)} places from which the goal was reached"
     goals = np.tile(last, (_HEADINGS, 1))

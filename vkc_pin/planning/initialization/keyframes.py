@@ -13,6 +13,7 @@ from vkc_pin.planning.chain.inverse_kinematics import MAX_STEP, PoseSolver
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Bools, Floats
+from vkc_pin.world.scene.clearance_exemptions import ACCEPTED_SHORTFALL
 
 __all__ = [
     "SAMPLE_COUNT",
@@ -20,6 +21,7 @@ __all__ = [
     "KeyframeCache",
     "KeyframeSampler",
     "compute_shortfall",
+    "find_free_configurations",
     "interpolate_object_joints",
     "sample_goal_configurations",
     "sample_smoothstep",
@@ -316,7 +318,7 @@ class KeyframeSampler:
         rows = [
             np.frombuffer(row)
             for (at, row), shortfall in self.cache.shortfalls.items()
-            if at == waypoint and shortfall <= 0.0
+            if at == waypoint and shortfall <= ACCEPTED_SHORTFALL
         ]
         pose = self.find_pose(waypoint)
         if pose is None or not rows:
@@ -345,6 +347,19 @@ def compute_shortfall(
     waypoints = np.full(len(z), waypoint)
     contacts = problem.contacts.evaluate(z, waypoints, reach=reach, nearest=1, static=static)
     return contacts.compute_shortfall(len(z))
+
+
+def find_free_configurations(problem: TrajectoryProblem, z: Floats, waypoint: int) -> Bools:
+    """Return which configurations keep the clearance that validation demands, shape (B,).
+
+    Args:
+        problem: Problem.
+        z: Configurations, shape (B, n).
+        waypoint: Waypoint of the configurations.
+    """
+    if not len(z):
+        return np.zeros(0, bool)
+    return np.asarray(compute_shortfall(problem, z, waypoint) <= ACCEPTED_SHORTFALL)
 
 
 def sample_goal_configurations(

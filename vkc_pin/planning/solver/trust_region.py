@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.scene.clearance_exemptions import ACCEPTED_SHORTFALL
 
 __all__ = ["TrustRegion", "is_step_acceptable"]
 
@@ -17,8 +18,9 @@ SETTLE_RADIUS = 0.05  # [m], [rad] within which the planes approximate the dista
 SHRINK = 0.4  # factor on the smaller of radius and step where the prediction was poor
 # merit change in a block that is ignored: 8 mm of shortfall at the initial penalty weight
 NEGLIGIBLE_CHANGE = 0.4
-# [m] shortfall at a waypoint, clearance within segments, and steps (also [rad]) that are negligible
-CLEARANCE_TOLERANCE = 5e-4
+# [m] shortfall at a waypoint, clearance within segments, and steps (also [rad]) that are
+# negligible: half of what validation accepts, so that it accepts all that converges
+CLEARANCE_TOLERANCE = ACCEPTED_SHORTFALL / 2
 
 
 class TrustRegion:

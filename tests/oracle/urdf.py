@@ -11,6 +11,7 @@ from typing import Any
 import coal
 import numpy as np
 import trimesh
+from helpers.assimp import read_triangles
 
 from .plan import NotJudged
 from .poses import Poses, make_pose, rotate_rpy
@@ -68,10 +69,11 @@ def load_mesh_hull(file: Path, scale: np.ndarray) -> coal.Convex:
     if not file.is_file():
         raise FileNotFoundError(file)
     if file.suffix.lower() == ".dae":  # trimesh needs an optional dependency
-        mesh = coal.MeshLoader().load(str(file), np.ones(3))
-        points = np.array(mesh.vertices())
+        points = read_triangles(file).reshape(-1, 3)
     else:
         points = np.asarray(trimesh.load(file, force="mesh", skip_materials=True).vertices)
+    if file.suffix.lower() in (".gltf", ".glb"):  # y is up
+        points = points[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
     hull = trimesh.convex.convex_hull(_thicken(points * scale))
     if np.bincount(hull.faces.ravel()).max() > 255:
         raise NotJudged(f"{file.name}: a vertex has more neighbours than coal supports")

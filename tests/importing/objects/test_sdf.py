@@ -365,6 +365,8 @@ def test_submesh_selects_a_part_of_a_mesh_file(tmp_path: Path) -> None:
     ):
         box = trimesh.creation.box(size).apply_translation(at)
         scene.add_geometry(box, node_name=name)
+    # In glTF files y is up.
+    scene.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2.0, (1, 0, 0)))
     scene.export(tmp_path / "both.glb")
     text = format_chest(pose="0 0 0 0 0 0")
     box = "<box><size>0.02 0.56 0.3</size></box>"

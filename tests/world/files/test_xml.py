@@ -11,7 +11,7 @@ from helpers.expected_errors import expect_error
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vkc_pin.world.files.xml import check_collada, find_line, parse_xml, quote, replace_forbidden
+from vkc_pin.world.files.xml import find_line, parse_xml, quote, replace_forbidden
 
 FILE = Path("thing.urdf")
 
@@ -58,26 +58,6 @@ def test_entities_are_rejected() -> None:
     many = "".join(f'<!ENTITY e{k} "{f"&e{k - 1};" * 10 if k else "lol"}">' for k in range(12))
     with expect_error("e0: entities are not supported", line=2):
         parse_xml(f'<?xml version="1.0"?>\n<!DOCTYPE r [{many}]><robot name="&e11;"/>', FILE)
-
-
-@pytest.mark.parametrize("indices", ["0 ~ 1", "0 1.5 2", "0 1 2x", "<![CDATA[0 ~ 1]]>"])
-@pytest.mark.parametrize("tag", ["p", "vcount", "c:p"])
-def test_invalid_indices_raise(tmp_path: Path, indices: str, tag: str) -> None:
-    file = tmp_path / "mesh.dae"
-    file.write_text(f"<a xmlns:c='c'>\n<{tag}>{indices}</{tag}></a>", encoding="utf-8")
-    with expect_error(r"mesh.dae:2: <.*>: not indices"):
-        check_collada(file)
-
-
-def test_valid_indices_are_accepted(tmp_path: Path) -> None:
-    file = tmp_path / "mesh.dae"
-    file.write_text("<a><p>0 1 -1\n2 &#51;<!-- x --></p><n>x</n><p/></a>", encoding="utf-16")
-    check_collada(file)
-    file.write_text("<a><p>0", encoding="utf-8")
-    with expect_error("not valid XML"):
-        check_collada(file)
-    with expect_error("cannot read"):
-        check_collada(tmp_path)
 
 
 @given(st.text())

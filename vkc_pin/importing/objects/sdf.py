@@ -26,6 +26,7 @@ from vkc_pin.importing.objects.sdf_scope import BASE, RULES, WORLD, Rules, Scope
 from vkc_pin.utils.arrays import MAX_COORDINATE, MIN_POSITIVE
 from vkc_pin.utils.system import is_file
 from vkc_pin.world.files.documents import read_text
+from vkc_pin.world.files.gltf import GLTF_SUFFIXES
 from vkc_pin.world.files.kinematic_tree import MOMENTS, find_roots
 from vkc_pin.world.files.meshes import load_mesh
 from vkc_pin.world.files.resources import find_mesh_file, iterate_address_candidates
@@ -532,6 +533,9 @@ class _Reader:
     ) -> dict[str, Any]:
         """Return kind, size, file and triangles of a shape."""
         if file is not None:
+            if file.suffix.lower() in GLTF_SUFFIXES:
+                turned = "is turned from y up, as glTF specifies, to z up, unlike in Gazebo"
+                self.notes.append(f"{file.name} {turned}")
             size = scope.read_numbers(shape, "scale", 3, "1 1 1", name)
             part = shape.find("submesh")
             if part is None:

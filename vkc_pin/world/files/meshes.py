@@ -1,8 +1,9 @@
 """Reads mesh files and converts them to coal shapes, whose volume and area are checked.
 
 Meshes are read with trimesh: coal 3.0.3 restarts the triangle indices at every object of an OBJ
-file. Only COLLADA files (`.dae`), for which trimesh would need another package, are read by coal,
-which ignores their unit. As in RViz and Gazebo, the unit counts and the upward axis does not.
+file and at every material of a COLLADA file. Only COLLADA files (`.dae`) are read by
+`vkc_pin.world.files.collada`. In glTF files y points up, by their specification; as in RViz 2,
+Drake and Blender, they are turned such that z does.
 """
 
 from __future__ import annotations
@@ -10,11 +11,7 @@ from __future__ import annotations
 import codecs
 import contextlib
 import io
-import re
-import tempfile
 import warnings
-import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -26,11 +23,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.utils.arrays import MAX_COORDINATE, Floats, Ints
-from vkc_pin.utils.isolation import run_isolated
-from vkc_pin.world.files.documents import read_text
+from vkc_pin.world.files.collada import read_collada
+from vkc_pin.world.files.gltf import GLTF_SUFFIXES, GLTF_TO_Z_UP, check_gltf
 from vkc_pin.world.files.hulls import SHEET_THICKNESS, compute_hull, compute_outer_hull, thicken
+from vkc_pin.world.files.polygon_files import (
+    divide_polygons,
+    is_plain_obj,
+    normalize_obj,
+    read_off,
+)
 from vkc_pin.world.files.resources import check_path
-from vkc_pin.world.files.xml import check_collada, parse_xml
 
 if TYPE_CHECKING:
     import trimesh
@@ -49,8 +51,6 @@ __all__ = [
 _MAX_NEIGHBOURS = 255  # coal's corners have no more
 _MAX_CACHED_HULLS = 512  # that a process keeps: robots are loaded again and again
 _SMALLEST = 1e-6  # [m] size of meshes, below which triangles have no area in floating point
-# Faces of OBJ files whose corners count from the end, or from 0
-_NOT_FROM_ONE = re.compile(rb"\nf[^\n]*[ /][-0]")
 _HULL_TOLERANCE = 1e-6  # how far, relatively, coal's volume and area may be from trimesh's
 
 
@@ -90,22 +90,12 @@ def load_mesh(
     factors = _check_scale(file, scale)
     if not file.is_file():
         raise InputError("there is no such mesh", file=file, expected="a mesh file")
-    by_coal = file.suffix.lower() == ".dae"
-    if by_coal:
-        factors = factors * check_collada(file)
     try:
-        if by_coal:
-            mesh = _read_collada(file, submesh)
-        else:
-            source, settings = _open_mesh(file, submesh)
-            mesh = trimesh.load_scene(source, force="mesh", skip_materials=True, **settings)
-            if submesh is not None and file.suffix.lower() != ".obj":
-                mesh = _extract_submesh(mesh, file, submesh)
-            mesh = mesh.to_mesh()
+        mesh = _read_mesh(file, submesh)
     except InputError:
         raise
     except Exception as error:  # readers raise any type
-        expected = "a COLLADA file" if by_coal else "an OBJ, STL, PLY, OFF, glTF or COLLADA file"
+        expected = "an OBJ, STL, PLY, OFF, glTF or COLLADA file"
         raise InputError(f"cannot read the mesh: {error}", file=file, expected=expected) from error
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise InputError("the mesh is empty", file=file, expected="at least one triangle")
@@ -132,46 +122,48 @@ def load_mesh(
     return mesh
 
 
-def _read_collada(file: Path, submesh: str | None) -> trimesh.Trimesh:
-    """Return a COLLADA file, or the geometry of one of its nodes, in the file's unit."""
+def _read_mesh(file: Path, submesh: str | None) -> Any:
+    """Return a mesh, or what trimesh takes a file for, with z up if the format states its axes."""
     import trimesh
 
-    with tempfile.TemporaryDirectory() as scratch:
-        source = file.absolute()
-        if submesh is not None:
-            source = Path(scratch, "submesh.dae")
-            _copy_submesh(file, submesh, source)
-        # It is compiled code, which invalid files crash.
-        vertices, faces = run_isolated(
-            _parse_collada, source, program="the COLLADA reader", file=file
-        )
-    return trimesh.Trimesh(vertices, faces)
+    kind = file.suffix.lower()
+    if kind == ".dae":
+        vertices, faces, unit = read_collada(file, submesh)
+        # Vertices that coincide are merged in the file's unit.
+        return trimesh.Trimesh(vertices, faces).apply_scale(unit)
+    if kind == ".off":
+        return trimesh.Trimesh(*read_off(file.read_bytes(), file))
+    source, settings = _open_mesh(file, submesh)
+    scene = trimesh.load_scene(source, force="mesh", skip_materials=True, **settings)
+    if submesh is not None and kind != ".obj":
+        scene = _extract_submesh(scene, file, submesh)
+    mesh = scene.to_mesh()
+    if kind == ".ply":
+        vertices, polygons = _find_polygons(mesh)
+        if polygons:
+            mesh = trimesh.Trimesh(vertices, divide_polygons(vertices, polygons, file))
+    if kind in GLTF_SUFFIXES:
+        mesh.apply_transform(GLTF_TO_Z_UP)
+    return mesh
 
 
-def _copy_submesh(file: Path, submesh: str, copy: Path) -> None:
-    """Write a COLLADA file without the geometry of all nodes but those with a name."""
-    root = parse_xml(read_text(file, "COLLADA"), file)
-    labels = {
-        f"#{geometry.get('id')}": {geometry.get("id", ""), geometry.get("name", "")}
-        for geometry in root.iter("geometry")
-    }
-    names, is_found = dict[str, None](), False
-    for node in root.iter("node"):
-        for instance in node.findall("instance_geometry"):
-            own = {node.get("name", ""), node.get("id", "")}
-            own |= labels.get(instance.get("url", ""), set())
-            names.update(dict.fromkeys(sorted(own - {""})))
-            is_found |= submesh in own
-            if submesh not in own:
-                node.remove(instance)
-    if not is_found:
-        raise UnknownNameError("submesh", submesh, names, file=file)
-    ElementTree.ElementTree(root).write(copy, encoding="utf-8", xml_declaration=True)
+def _find_polygons(mesh: trimesh.Trimesh) -> tuple[Floats, list[Ints]]:
+    """Return vertices and polygons of a PLY file as trimesh keeps them beside its triangles.
 
-
-def _parse_collada(file: Path) -> tuple[Floats, Ints]:
-    shape = coal.MeshLoader().load(str(file), np.ones(3))
-    return np.array(shape.vertices()), get_triangles(shape)
+    There are none if all are triangles.
+    """
+    elements = mesh.metadata.get("_ply_raw", {})
+    if not {"vertex", "face"} <= set(elements):
+        return np.empty((0, 3)), []
+    points, faces = elements["vertex"]["data"], elements["face"]["data"]
+    vertices = np.column_stack([np.asarray(points[axis], float) for axis in "xyz"])
+    is_text = isinstance(faces, dict)
+    names = list(faces) if is_text else list(faces.dtype.names)
+    name = next((name for name in names if name.startswith("vertex_ind")), names[0])
+    # Lists in binary files hold their length and their items.
+    polygons = faces[name] if is_text else faces[name]["f1"]
+    are_triangles = np.shape(polygons) == (len(polygons), 3)
+    return vertices, [] if are_triangles else [np.array(one, np.int64) for one in polygons]
 
 
 def _extract_submesh(scene: trimesh.Scene, file: Path, submesh: str) -> trimesh.Scene:
@@ -193,20 +185,15 @@ def _open_mesh(file: Path, submesh: str | None = None) -> tuple[Path | io.BytesI
     """Return what trimesh reads a mesh from, changed where it would misread it, and settings."""
     settings: dict[str, Any] = {"resolver": _make_resolver(file)}
     kind = file.suffix.lower()[1:]
+    if f".{kind}" in GLTF_SUFFIXES:
+        check_gltf(file)
     if kind not in ("obj", "gltf"):
         return file, settings
     data = file.read_bytes()
     if is_utf16 := data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         data = data.decode("utf-16").encode()
-    is_usual = (
-        submesh is None
-        and not data.startswith((codecs.BOM_UTF8, b" "))
-        and not any(text in data for text in (b"\t", b"\n ", b"\\\n", b"\\\r"))
-        and data.count(b"\r") == data.count(b"\r\n")
-        and not _NOT_FROM_ONE.search(data)
-    )
-    if kind == "obj" and not is_usual:
-        data = _normalize_obj(data, file, submesh)
+    if kind == "obj" and (submesh is not None or not is_plain_obj(data)):
+        data = normalize_obj(data, file, submesh)
     elif is_utf16 or data.startswith(codecs.BOM_UTF8):
         data = data.removeprefix(codecs.BOM_UTF8)
     else:
@@ -229,48 +216,6 @@ def _make_resolver(file: Path) -> Any:
 
     resolver.get = get
     return resolver
-
-
-def _normalize_obj(data: bytes, file: Path, submesh: str | None) -> bytes:
-    """Return an OBJ file with plain lines, faces that count from 1, and one object if named."""
-    for old, new in ((b"\r\n", b"\n"), (b"\r", b"\n"), (b"\\\n", b" ")):
-        data = data.replace(old, new)
-    counts = {b"v": 0, b"vt": 0, b"vn": 0}
-    wanted = None if submesh is None else submesh.encode()
-    lines, names = list[bytes](), dict[str, None]()
-    is_kept = is_found = wanted is None
-    for number, line in enumerate(data.removeprefix(codecs.BOM_UTF8).split(b"\n"), 1):
-        key, *values = line.split() or [b""]
-        if key in counts:
-            counts[key] += 1
-        elif key in (b"o", b"g"):  # a group may have several names
-            own = {b" ".join(values), *values}
-            names.update(dict.fromkeys(name.decode(errors="replace") for name in sorted(own)))
-            is_kept = wanted is None or wanted in own
-        elif key == b"f":
-            if not is_kept:
-                continue
-            is_found = True
-            corners = line.partition(b"#")[0].split()[1:]
-            values = [_count_from_start(corner, counts, file, number) for corner in corners]
-        lines.append(b" ".join([key, *values]))
-    if not is_found:
-        raise UnknownNameError("submesh", str(submesh), names, file=file)
-    return b"\n".join(lines)
-
-
-def _count_from_start(corner: bytes, counts: Mapping[bytes, int], file: Path, line: int) -> bytes:
-    """Return a corner of a face, such as `-3/-3/1`, with indices that count from 1."""
-    indices = list[bytes]()
-    for text, count in zip(corner.split(b"/"), counts.values(), strict=False):
-        if text.startswith(b"-"):
-            text = b"%d" % (count + 1 + int(text))
-        if not indices and int(text) < 1:
-            problem, expected = "no such vertex", f"1 to {count}, or -1 to {-count} from the last"
-            got = corner.decode(errors="replace")
-            raise InputError(problem, file=file, line=line, field="f", expected=expected, got=got)
-        indices.append(text)
-    return b"/".join(indices)
 
 
 def load_convex(

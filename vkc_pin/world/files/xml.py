@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -10,11 +9,10 @@ from typing import Any
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
-from vkc_pin.errors import InputError, format_value
+from vkc_pin.errors import InputError
 from vkc_pin.world.files.documents import read_text
 
 __all__ = [
-    "check_collada",
     "find_line",
     "make_element_error",
     "parse_xml",
@@ -23,7 +21,6 @@ __all__ = [
     "replace_forbidden",
 ]
 
-_INDEX_ELEMENTS = ("h", "p", "v", "vcount")
 _MAX_DEPTH = 200  # of elements inside each other: Python writes and copies them recursively
 _FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
@@ -65,8 +62,11 @@ def read_xml(
     return text, root
 
 
-def parse_xml(text: str, file: Path) -> ElementTree.Element:
-    """Return the root of an XML document; `file` is for messages."""
+def parse_xml(text: str | bytes, file: Path) -> ElementTree.Element:
+    """Return the root of an XML document; `file` is for messages.
+
+    Bytes are in the encoding that the document states.
+    """
     builder = ElementTree.TreeBuilder(element_factory=_Element)
     parser, depth = expat.ParserCreate(), 0
 
@@ -100,8 +100,9 @@ def parse_xml(text: str, file: Path) -> ElementTree.Element:
 
     parser.StartElementHandler, parser.EndElementHandler = start, end
     parser.CharacterDataHandler, parser.EntityDeclHandler = builder.data, entity
+    parser.buffer_text = True
     try:
-        parser.Parse(text.encode(), True)
+        parser.Parse(text.encode() if isinstance(text, str) else text, True)
         return builder.close()
     except expat.ExpatError as error:
         raise InputError(f"not valid XML: {error}", file=file, line=error.lineno) from error
@@ -115,52 +116,3 @@ def replace_forbidden(text: str) -> str:
 def quote(text: str) -> str:
     """Quote text as the value of an XML attribute, without forbidden characters."""
     return quoteattr(replace_forbidden(text))
-
-
-def check_collada(file: Path) -> float:
-    """Check that index lists in a COLLADA file hold integers, and return the file's unit [m].
-
-    Assimp hangs on other index lists, and coal ignores the unit.
-    """
-    parser, inside = expat.ParserCreate(), list[str]()
-    unit = ["1"]
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        inside.append(tag.rpartition(":")[2])
-        if inside == ["COLLADA", "asset", "unit"]:
-            unit[:] = [attributes.get("meter", "1")]
-
-    def text(data: str) -> None:
-        if inside and inside[-1] in _INDEX_ELEMENTS and data.strip("0123456789+- \t\r\n"):
-            line, field = parser.CurrentLineNumber, f"<{inside[-1]}>"
-            raise InputError(
-                "not indices",
-                file=file,
-                line=line,
-                field=field,
-                expected="whole numbers",
-                got=format_value(data),
-            )
-
-    def end(_: str) -> None:
-        inside.pop()
-
-    parser.StartElementHandler, parser.EndElementHandler, parser.CharacterDataHandler = (
-        start,
-        end,
-        text,
-    )
-    try:
-        parser.Parse(file.read_bytes(), True)
-    except expat.ExpatError as error:
-        raise InputError(f"not valid XML: {error}", file=file, line=error.lineno) from error
-    except OSError as error:
-        raise InputError("cannot read the file", file=file, got=error.strerror) from error
-    try:
-        metres = float(unit[0])
-    except ValueError:
-        metres = math.nan
-    if not 0.0 < metres < math.inf:
-        field, expected = "<unit> meter", "a positive number"
-        raise InputError("not a unit", file=file, field=field, expected=expected, got=unit[0])
-    return metres

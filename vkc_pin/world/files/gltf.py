@@ -1,0 +1,87 @@
+"""Checks that trimesh reads all surfaces of a glTF file, and states the file's axes.
+
+In glTF files y points up and the unit is the metre, by their specification.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vkc_pin.errors import InputError
+
+__all__ = ["GLTF_SUFFIXES", "GLTF_TO_Z_UP", "check_gltf"]
+
+GLTF_SUFFIXES = (".gltf", ".glb")
+"""Extensions of glTF files in lower case."""
+GLTF_TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], float)
+"""Rotation by a right angle about x, from y up to z up, shape (4, 4)."""
+_TRIANGLE_FAN = 6  # mode of a primitive
+_MODES = range(7)  # points, lines and triangles
+# Extensions without effect on surfaces, or that trimesh reads as the specification demands; a file
+# may require others, which move or compress its vertices.
+_KNOWN_PREFIXES = ("KHR_materials_", "KHR_texture_", "EXT_texture_", "KHR_lights_", "EXT_lights_")
+_KNOWN = ("KHR_mesh_quantization", "KHR_xmp_json_ld", "MSFT_texture_dds")
+_COPIES = "EXT_mesh_gpu_instancing"  # places a node's mesh many times
+
+
+def check_gltf(file: Path) -> None:
+    """Raise an `InputError` if a glTF file holds surfaces that trimesh would leave out or misplace.
+
+    These are triangle fans, normalized positions, instances on the graphics card, and extensions
+    that the file requires. Invalid files are left to trimesh.
+    """
+    document = _read_document(file)
+    required = _get_list(document, "extensionsRequired")
+    unknown = [
+        name
+        for name in required
+        if isinstance(name, str) and not name.startswith(_KNOWN_PREFIXES) and name not in _KNOWN
+    ]
+    if unknown:
+        raise _make_error(file, "a required extension", ", ".join(unknown))
+    for node in _get_list(document, "nodes"):
+        if isinstance(node, dict) and _COPIES in (node.get("extensions") or {}):
+            raise _make_error(file, "an extension of a node", _COPIES)
+    accessors = _get_list(document, "accessors")
+    for mesh in _get_list(document, "meshes"):
+        for primitive in _get_list(mesh, "primitives"):
+            if not isinstance(primitive, dict):
+                continue
+            if primitive.get("mode", 4) == _TRIANGLE_FAN or primitive.get("mode", 4) not in _MODES:
+                got = f"{mesh.get('name', 'a mesh')}: mode {primitive['mode']}"
+                raise _make_error(file, "this kind of primitive", got)
+            number: Any = (primitive.get("attributes") or {}).get("POSITION")
+            is_valid = isinstance(number, int) and 0 <= number < len(accessors)
+            if is_valid and accessors[number].get("normalized"):
+                raise _make_error(file, "normalized positions", mesh.get("name", "a mesh"))
+
+
+def _read_document(file: Path) -> Any:
+    """Return the JSON document of a file; None if there is no valid one."""
+    data = file.read_bytes()
+    if data.startswith(b"glTF") and len(data) >= 20:
+        (length,) = struct.unpack_from("<I", data, 12)
+        data = data[20 : 20 + length]
+    try:
+        return json.loads(data.decode(json.detect_encoding(data)))
+    except (ValueError, RecursionError):
+        return None
+
+
+def _get_list(document: Any, key: str) -> list[Any]:
+    value = document.get(key) if isinstance(document, dict) else None
+    return value if isinstance(value, list) else []
+
+
+def _make_error(file: Path, what: str, got: str) -> InputError:
+    return InputError(
+        f"{what} of the glTF file is not supported",
+        file=file,
+        expected="triangles and strips of triangles, without compression",
+        got=got,
+    )

@@ -284,3 +284,87 @@ def test_errors_name_the_invalid_argument(
     with pytest.raises(vkc.InputError) as caught:
         decompose(mesh, **argument)  # type: ignore[arg-type]
     assert caught.value.field == field
+
+
+def make_bodies(rng: np.random.Generator, count: int, kind: str) -> Triangles:
+    """Make a mesh of many bodies: cones whose tips are in one plane, boards on a grid, or rods."""
+    bodies = []
+    for _ in range(count):
+        if kind == "cones":
+            body = trimesh.creation.cone(0.01, 0.02, sections=8)
+            body.apply_translation((*rng.uniform(-1.0, 1.0, 2), 0.0))
+        elif kind == "boards":
+            body = box((rng.choice([0.1, 0.2]), 0.018, rng.choice([0.018, 0.1])))
+            body.apply_translation(0.1 * rng.integers(0, 5, 3))
+        else:
+            body = trimesh.creation.cylinder(0.01, rng.uniform(0.05, 0.5), sections=6)
+            body.apply_transform(trimesh.transformations.random_rotation_matrix(rng.random(3)))
+            body.apply_translation(rng.uniform(-0.4, 0.4, 3))
+        bodies.append(body)
+    return concatenate(bodies)
+
+
+@pytest.mark.parametrize(
+    ("kind", "count", "seed"),
+    [
+        ("cones", 719, 1),
+        ("cones", 719, 2),
+        ("cones", 40, 3),
+        ("boards", 300, 4),
+        ("boards", 3, 5),
+        ("rods", 60, 6),
+    ],
+)
+def test_every_cut_of_meshes_of_many_bodies_divides_a_part(
+    kind: str, count: int, seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The best cut of the coarse surface may leave all of the part on one side."""
+    monkeypatch.setenv(disk_cache.CACHE_VARIABLE, "off")
+    slice_faces, slices = trimesh.intersections.slice_faces_plane, list[int]()
+
+    def count_slices(*args: object, **options: object) -> object:
+        slices.append(1)
+        assert len(slices) <= 2 * 64 * 2, "parts are cut without end"
+        return slice_faces(*args, **options)
+
+    monkeypatch.setattr(trimesh.intersections, "slice_faces_plane", count_slices)
+    rng = np.random.default_rng(seed)
+    mesh = make_bodies(rng, count, kind).apply_scale(rng.choice([1.0, 1.15, 1.25], 3))
+    pieces = decompose(mesh, error=0.01)
+    assert len(pieces.meshes) > 1
+    assert measure_uncovered(pieces.meshes, sample_points(mesh, 1000)).max() < 1e-4
+
+
+def make_drum(corners: int) -> Triangles:
+    """Make a convex body like the base of a robot: a drum of 0.56 m with a slanted top."""
+    angles = np.linspace(0.0, 2.0 * np.pi, corners, endpoint=False)
+    x, y = 0.28 * np.cos(angles), 0.28 * np.sin(angles)
+    rims = [np.column_stack([x, y, height]) for height in (np.zeros(corners), 0.3 + 0.2 * x)]
+    return trimesh.convex.convex_hull(np.vstack(rims))
+
+
+@pytest.mark.parametrize(
+    ("mesh", "error", "overhead", "most_vertices"),
+    [
+        (make_drum(90), 0.03, 0.0, 40),
+        (make_drum(90), 0.003, 0.0, 160),
+        (make_drum(90), 0.003, 0.15, 160),
+        (make_drum(300), 0.001, 0.0, 600),
+        (trimesh.creation.icosphere(3, 0.4), 0.004, 0.0, 642),
+        (trimesh.creation.cylinder(1.0, 0.02, sections=128), 0.005, 0.2, 160),
+    ],
+)
+def test_convex_meshes_keep_vertices_where_few_would_protrude(
+    mesh: Triangles,
+    error: float,
+    overhead: float,
+    most_vertices: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Excess volume that is acceptable for concave meshes excuses no protrusion."""
+    monkeypatch.setenv(disk_cache.CACHE_VARIABLE, "off")
+    pieces = decompose(mesh, error=error, overhead=overhead)
+    (piece,) = pieces.meshes
+    assert pieces.error <= error
+    assert len(piece.vertices) <= most_vertices
+    check_pieces(mesh, pieces)

@@ -52,10 +52,14 @@ ERROR = 0.02
 """Largest protrusion of pieces over the surface [m], about the clearance margin of motions."""
 PIECES = 12
 """Number of pieces of one mesh, unless cavities need more: planning time grows with it."""
-_VERSION = 4  # of the disk cache: increase it whenever the same mesh would be cut differently
+_VERSION = 5  # of the disk cache: increase it whenever the same mesh would be cut differently
 _CORNERS = 40  # largest number of vertices of a piece, as in the packaged collision geometry
 # Pieces are simplified only above this multiple of the vertex limit: simplifying takes a second.
 _CORNER_TOLERANCE = 1.5
+# Multiples of the vertex limit that are tried in turn while pieces protrude too far
+_CORNER_FACTORS = (1, 2, 4)
+# Of the error: part of a piece's protrusion that comes of few vertices and is not worth more
+_CORNER_SHARE = 0.2
 _FLATNESS = 1e-4  # [m] thickness up to which parts become plates
 _SAMPLES_PER_CELL = 16  # surface samples that detect the grid cells of a mesh's skin
 _MAX_SAMPLES = 4_000_000
@@ -71,6 +75,9 @@ _FREE_SHARE = 0.5  # of the error: pieces are merged up to this even if there ar
 _MERGE_SHARE = 0.8  # of the error: leaves room for what samples miss and for fewer vertices
 _EXTRA = 4  # multiple of `PIECES` up to which the error matters more than the number
 _MAX_PARTS = 64  # of a mesh before merging
+# Triangles for which the cuts of one mesh are sought, about a minute: there are up to `_MAX_PARTS`
+# cuts, of all that is left each
+_MAX_CUT_TRIANGLES = 20_000_000
 _MAX_HULL_POINTS = 1000  # of a part: if it has more, its hull is that of its extreme ones
 _MAX_TRIANGLES = 600  # of a part while its best cut is sought
 _MAX_COARSE_TRIANGLES = 150  # of a part while the most promising cuts are sought
@@ -143,7 +150,8 @@ def decompose(
         overhead: A hull whose excess volume, relative to the mesh, is no larger than this is kept
             whole, wherever it protrudes.
         corners: Largest number of vertices. A piece with half as many again is replaced by an
-            enclosing polytope.
+            enclosing polytope; where the pieces would then protrude by more than `error`, by one
+            with up to four times as many, or not at all.
 
     Raises:
         InputError: The mesh cannot be read or is empty, or an argument is invalid.
@@ -166,27 +174,25 @@ def decompose(
     else:
         loaded = load_mesh(check_path(mesh, "mesh", "a mesh or a mesh file"))
 
-    def measure(pieces: Sequence[trimesh.Trimesh]) -> Pieces:
-        return Pieces(tuple(pieces), _measure_protrusion(pieces, loaded), loaded)
-
     def is_sufficient(hull: Pieces) -> bool:
         if most_pieces == 1 or hull.error <= error:
             return True
         return overhead > 0.0 and not is_flat(loaded) and hull.overhead <= overhead
 
-    hull = measure([_make_hull(loaded.vertices)])
-    # A simplified hull contains the hull, and thus protrudes no less.
-    if is_sufficient(hull) and is_sufficient(hull := measure(_simplify(hull.meshes, corners))):
-        return hull
+    hull = _measure_pieces([_make_hull(loaded.vertices)], loaded)
+    if is_sufficient(hull):
+        return _simplify(hull, corners, error, is_sufficient)
 
     def cut_pieces() -> list[list[list[float]]]:
         """Return the vertices of each piece."""
         parts = _cut_mesh(loaded, most_pieces, error)
-        pieces = _simplify([_make_hull(part) for part in parts], corners)
-        return [piece.vertices.tolist() for piece in pieces]
+        exact = _measure_pieces([_make_hull(part) for part in parts], loaded)
+        pieces = _simplify(exact, corners, error, lambda simplified: True)
+        return [piece.vertices.tolist() for piece in pieces.meshes]
 
     key = _make_cache_key(loaded, most_pieces, error, corners)
-    return measure([compute_hull(np.array(piece)) for piece in load_or_build(key, cut_pieces)])
+    pieces = [compute_hull(np.array(piece)) for piece in load_or_build(key, cut_pieces)]
+    return _measure_pieces(pieces, loaded)
 
 
 def compute_concavity(mesh: trimesh.Trimesh) -> float:
@@ -236,14 +242,31 @@ def _make_hull(points: Floats) -> trimesh.Trimesh:
     return compute_hull(thicken(points, _FLATNESS)[0])
 
 
-def _simplify(pieces: Sequence[trimesh.Trimesh], corners: int) -> list[trimesh.Trimesh]:
-    """Replace pieces with many vertices by enclosing polytopes with few."""
-    return [
-        compute_outer_hull(one.vertices, vertices=corners)
-        if len(one.vertices) > _CORNER_TOLERANCE * corners
-        else one
-        for one in pieces
-    ]
+def _measure_pieces(pieces: Sequence[trimesh.Trimesh], mesh: trimesh.Trimesh) -> Pieces:
+    return Pieces(tuple(pieces), _measure_protrusion(pieces, mesh), mesh)
+
+
+def _simplify(
+    exact: Pieces, corners: int, error: float, is_sufficient: Callable[[Pieces], bool]
+) -> Pieces:
+    """Return polytopes with few vertices around pieces.
+
+    Those that protrude far over their piece get more vertices, up to all, while the pieces miss
+    `error` [m] or are not sufficient: protrusions block motions, vertices cost little time.
+    """
+    slack = _CORNER_SHARE * error
+    aim = error if exact.error <= error else exact.error + slack
+    pieces = list(exact.meshes)
+    for factor in _CORNER_FACTORS:
+        for k, piece in enumerate(exact.meshes):
+            if len(piece.vertices) <= _CORNER_TOLERANCE * factor * corners:
+                pieces[k] = piece
+            elif factor == 1 or measure_outside(piece, pieces[k].vertices).max() > slack:
+                pieces[k] = compute_outer_hull(piece.vertices, vertices=factor * corners)
+        simplified = _measure_pieces(pieces, exact.mesh)
+        if simplified.error <= aim and is_sufficient(simplified):
+            return simplified
+    return exact
 
 
 def _measure_protrusion(pieces: Sequence[trimesh.Trimesh], mesh: trimesh.Trimesh) -> float:
@@ -445,39 +468,57 @@ def _cut_surface(mesh: trimesh.Trimesh, surface: _Surface, limit: float) -> list
     queue = list[tuple[float, int, _Hull, Floats, Ints]]()
 
     def add_part(vertices: Floats, faces: Ints) -> None:
-        if len(faces):
-            used, renumbered = np.unique(faces, return_inverse=True)
-            hull = _Hull(vertices[used], surface)
-            part = vertices[used], renumbered.reshape(-1, 3)
-            heapq.heappush(queue, (-hull.protrusion, next(numbers), hull, *part))
+        used, renumbered = np.unique(faces, return_inverse=True)
+        hull = _Hull(vertices[used], surface)
+        part = vertices[used], renumbered.reshape(-1, 3)
+        heapq.heappush(queue, (-hull.protrusion, next(numbers), hull, *part))
 
     for group in groups:
         add_part(vertices, group)
-    while queue and len(queue) + len(finished) < _MAX_PARTS:
+    work = 0  # triangles for which cuts were sought
+    # Each step finishes a part, or divides it into more parts: there are at most `_MAX_PARTS`.
+    while queue and len(queue) + len(finished) < _MAX_PARTS and work < _MAX_CUT_TRIANGLES:
         *_, hull, vertices, faces = heapq.heappop(queue)
-        plane = _find_cut(vertices, faces) if hull.protrusion > limit else None
-        if plane is None:
+        work += len(faces)
+        parts = _divide(vertices, faces) if hull.protrusion > limit else []
+        if not parts:
             finished.append(hull)
-        else:
-            for part in _clip(vertices, faces, *plane):
-                add_part(*part)
+        for part in parts:
+            add_part(*part)
     return finished + [hull for *_, hull, _, _ in queue]
+
+
+def _divide(vertices: Floats, faces: Ints) -> list[tuple[Floats, Ints]]:
+    """Return the parts into which the best cut that divides a part cuts it; none if no cut does.
+
+    Cuts are rated on a coarser surface: all of the part may lie on one side of the best.
+    """
+    for normal, offset in _rank_cuts(vertices, faces):
+        parts = _clip(vertices, faces, normal, offset)
+        if len(parts) > 1:
+            return parts
+    return []
 
 
 def _clip(
     vertices: Floats, faces: Ints, normal: Floats, offset: float
-) -> Iterator[tuple[Floats, Ints]]:
-    """Yield the triangles in a plane, below and above it; those across it are divided."""
+) -> list[tuple[Floats, Ints]]:
+    """Return the triangles in a plane, below and above it, where there are any.
+
+    Triangles across the plane are divided.
+    """
     import trimesh
 
     heights = _measure_heights(vertices, normal, offset)
     in_plane = (heights[faces] == 0.0).all(axis=1)
-    yield vertices, faces[in_plane]
+    parts = [(vertices, faces[in_plane])]
     others = faces[~in_plane]
     for sign in (-1.0, 1.0):
-        yield trimesh.intersections.slice_faces_plane(
+        cut = trimesh.intersections.slice_faces_plane(
             vertices, others, sign * normal, offset * normal, cached_dots=sign * heights
-        )[:2]
+        )
+        parts.append((cut[0], cut[1]))
+    return [part for part in parts if len(part[1])]
 
 
 def _measure_heights(vertices: Floats, normal: Floats, offset: float) -> Floats:
@@ -486,12 +527,12 @@ def _measure_heights(vertices: Floats, normal: Floats, offset: float) -> Floats:
     return np.where(np.abs(heights) < _SNAP, 0.0, heights)
 
 
-def _find_cut(vertices: Floats, faces: Ints) -> tuple[Floats, float] | None:
-    """Return the normal and offset of the plane that divides a part best, or None.
+def _rank_cuts(vertices: Floats, faces: Ints) -> Iterator[tuple[Floats, float]]:
+    """Yield normals and offsets of planes that divide a part, the best first.
 
-    That is the plane that reduces the volume of the hulls most. Several cuts may be needed before
-    the volume falls, since the hull of half a ring is half a disc: planes of large facets, and to
-    a lesser degree those through the middle, are preferred.
+    The best reduces the volume of the hulls most. Several cuts may be needed before the volume
+    falls, since the hull of half a ring is half a disc: planes of large facets, and to a lesser
+    degree those through the middle, are preferred.
     """
     vertices, faces = _coarsen(vertices, faces, _MAX_TRIANGLES)
     planes = list(_list_planes(vertices, faces))
@@ -500,10 +541,10 @@ def _find_cut(vertices: Floats, faces: Ints) -> tuple[Floats, float] | None:
         best = np.argsort(-values, kind="stable")[:_PROMISING_PLANES]
         planes = [planes[k] for k in np.sort(best)]
     values = _rate_planes(vertices, faces, planes)
-    if not np.isfinite(values).any():
-        return None
-    normal, offset, _ = planes[int(values.argmax())]
-    return normal, offset
+    for k in np.argsort(-values, kind="stable"):
+        if np.isfinite(values[k]):
+            normal, offset, _ = planes[k]
+            yield normal, offset
 
 
 def _rate_planes(

@@ -15,6 +15,7 @@ from scipy.spatial import ConvexHull
 
 from vkc_pin.world.files.hulls import compute_hull, compute_outer_hull
 from vkc_pin.world.files.meshes import (
+    get_triangles,
     load_convex,
     load_mesh,
     load_parts,
@@ -338,3 +339,23 @@ def test_outer_hulls_of_dense_meshes_need_little_memory() -> None:
     assert len(hull.vertices) <= 40
     assert compute_excess(ball.vertices, hull).max() < 1e-9
     assert 1.0 < hull.volume / ball.volume < 1.2
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-2, 1e-3, 1e-4, 1e-5])
+@pytest.mark.parametrize("middle", [0.0, 1.0])
+def test_hulls_of_small_parts_are_closed(size: float, middle: float) -> None:
+    """Points of cut meshes lie almost in the same planes: facets are slivers."""
+    rng = np.random.default_rng(0)
+    for count in (5, 21, 60):
+        points = rng.normal(size=(count, 3))
+        twins = points + 1e-6 * rng.normal(size=points.shape)
+        almost_flat = np.column_stack([points[:, :2], 1.0 + 1e-8 * points[:, 2]])
+        for chosen in (points, np.vstack([points, twins]), np.vstack([points, almost_flat])):
+            placed = (size * chosen + middle).astype(np.float32).astype(float)
+            shape = make_convex_hull(placed)
+            held = np.asarray(shape.points())
+            # About the middle: volumes of small bodies far from the origin are inexact.
+            expected = ConvexHull(placed - placed.mean(axis=0)).volume
+            hull = trimesh.Trimesh(held - placed.mean(axis=0), get_triangles(shape))
+            assert hull.volume == pytest.approx(expected, rel=1e-5)
+            assert compute_excess(placed, compute_hull(placed)).max() < 2e-8

@@ -25,6 +25,9 @@ _FLATNESS_RATIO = (
 _MIN_CUT_DEPTH = 5e-4  # [m]: no cut takes away less
 _NUM_DIRECTIONS = 400  # of cuts, spread over the sphere
 _NUM_CUTS = 12  # deepest planes of which one is chosen
+# Twice the area of facets that count as none, relative to the square of the hull's size, as in
+# trimesh for a size of 1 m
+_NO_AREA = float(np.finfo(np.float64).resolution * 100.0)
 _MAX_FACETS = 1000  # of a hull whose normals are all candidate cuts
 # Options of Qhull, tried in this order: scaled to the unit cube, unscaled, and joggled.
 _QHULL_OPTIONS = ("QbB Pp Qt", "Pp Qt", "Pp QJ")
@@ -74,7 +77,12 @@ def _orient_faces(hull: ConvexHull) -> trimesh.Trimesh:
 
     corners = np.sort(hull.vertices)
     vertices, faces = hull.points[corners], np.searchsorted(corners, hull.simplices)
-    normals, has_area = trimesh.triangles.normals(vertices[faces])
+    # Facets of small hulls have small areas: those without count relative to a size below 1 m.
+    size = min(float(np.ptp(vertices, axis=0).max()), 1.0)
+    crosses = trimesh.triangles.cross(vertices[faces])
+    normals, has_area = trimesh.util.unitize(
+        crosses, check_valid=True, threshold=_NO_AREA * size**2
+    )
     faces = faces[has_area]
     centres = vertices[faces].mean(axis=1)
     areas = trimesh.triangles.area(vertices[faces])

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import trimesh
 
@@ -209,6 +210,22 @@ VISUAL, MESH_GEOM = ' contype="0" conaffinity="0"', '<geom type="mesh" mesh="l"{
             )
         ),
         ({"head": '<default class="old"/>', "leaf": ' class="old"'}, "settings of MuJoCo 2"),
+        *(
+            (
+                {
+                    "inertial": f'<inertial pos="0 0 0" mass="3" {turn} '
+                    'fullinertia="0.1 0.1 0.05 0 0 0"/>'
+                },
+                "settings of MuJoCo 2",
+            )
+            for turn in (
+                'quat="1 0 0 0"',
+                'euler="0 0 1"',
+                'axisangle="0 0 1 1"',
+                'xyaxes="1 0 0 0 1 0"',
+                'zaxis="0 0 1"',
+            )
+        ),
         ({"tail": '<keyframe><key qpos="0 0 0"/></keyframe>'}, "invalid qpos size"),
         ({"tail": '<sensor><touch site="none"/></sensor>'}, "unrecognized name 'none'"),
         ({"tail": '<actuator><motor joint="none"/></actuator>'}, "actuator"),
@@ -268,6 +285,16 @@ def test_errors_in_the_geometry_and_in_includes_are_raised(
     trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "there.stl")
     with pytest.raises(InputError, match=message):
         compile_door(tmp_path, **parts)
+
+
+def test_full_inertias_keep_their_axes_beside_an_orientation(tmp_path: Path) -> None:
+    """MuJoCo 2 took the axes from the matrix, whatever else was stated."""
+    inertial = '<inertial pos="0 0 0" mass="3" {} fullinertia="0.1 0.2 0.25 0 0 0"/>'
+    plain, notes = compile_door(tmp_path, inertial=inertial.format(""))
+    assert not notes
+    turned, _ = compile_door(tmp_path, inertial=inertial.format('quat="0.6 0.8 0 0"'))
+    np.testing.assert_allclose(turned.body_inertia, plain.body_inertia)
+    np.testing.assert_allclose(turned.body_iquat, plain.body_iquat)
 
 
 def test_a_file_for_mujoco_2_is_read_with_its_includes(tmp_path: Path) -> None:

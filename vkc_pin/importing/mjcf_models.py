@@ -25,6 +25,8 @@ _REDUCED = (
 # What MuJoCo 2 knew and later versions reject: settings that do not matter for geometry.
 _SETTINGS = ("custom", "option", "size", "statistic", "visual")
 _COMPILER_SETTINGS = ("convexhull", "exactmeshinertia")
+# Orientations of an <inertial>, which MuJoCo 2 ignored beside `fullinertia`
+_ORIENTATIONS = ("axisangle", "euler", "quat", "xyaxes", "zaxis")
 
 
 def compile_mjcf(file: Path) -> tuple[Any, list[str]]:
@@ -97,6 +99,10 @@ def _convert_from_mujoco_2(path: Path) -> str:
     A class of defaults at the top level, which MuJoCo 2 added, becomes a class in "main".
     """
     root = _read_with_includes(path, path.parent, [])
+    for inertial in root.iter("inertial"):
+        if "fullinertia" in inertial.attrib:
+            for name in _ORIENTATIONS:
+                inertial.attrib.pop(name, None)
     for element in list(root):
         if element.tag in _SETTINGS:
             root.remove(element)

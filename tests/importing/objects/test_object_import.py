@@ -136,3 +136,59 @@ def test_packages_and_arguments_of_xacro_are_used(tmp_path: Path) -> None:
     found = read_description(file, packages=packages, arguments={"depth": "0.25"})
     assert found.joints["front"].limits == (0.0, 0.25)
     assert found.links["case"].collision[0].file == tmp_path / "parts" / "case.stl"
+
+
+FORMATS = {
+    "urdf": """<robot name="door"><link name="frame">{box}</link><link name="leaf">{box}</link>
+<joint name="hinge" type="revolute"><parent link="frame"/><child link="leaf"/>
+<origin xyz="1 0 0"/><axis xyz="0 0 1"/>
+<limit lower="0" upper="1" velocity="1e6"/><dynamics damping="{damping}" friction="{friction}"/>
+</joint></robot>""",
+    "xml": """<mujoco><worldbody><body name="frame"><geom type="box" size=".2 .3 .4"/>
+<body name="leaf" pos="1 0 0"><joint name="hinge" axis="0 0 1" range="0 57" damping="{damping}"
+frictionloss="{friction}"/><geom type="box" size=".2 .3 .4"/></body></body></worldbody></mujoco>""",
+    "sdf": """<sdf version="1.9"><model name="door"><link name="frame">{sdf_box}</link>
+<link name="leaf"><pose>1 0 0 0 0 0</pose>{sdf_box}</link><joint name="hinge" type="revolute">
+<parent>frame</parent><child>leaf</child><axis><xyz>0 0 1</xyz><limit><lower>0</lower>
+<upper>1</upper></limit><dynamics><damping>{damping}</damping><friction>{friction}</friction>
+</dynamics></axis></joint></model></sdf>""",
+}
+BOX = '<collision><geometry><box size="0.4 0.6 0.8"/></geometry></collision>'
+SDF_BOX = """<collision name="c"><geometry><box><size>0.4 0.6 0.8</size></box></geometry>
+</collision>"""
+
+
+def write_door(folder: Path, kind: str, **values: object) -> Path:
+    """Write a frame and a leaf beside it as "urdf", "xml" (MJCF) or "sdf"."""
+    file = folder / f"door.{kind}"
+    given = {"damping": 0, "friction": 0, "box": BOX, "sdf_box": SDF_BOX, **values}
+    file.write_text(FORMATS[kind].format(**given))
+    return file
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize(("damping", "friction"), [(3e4, 0.5), (2.0, 1e7), (1e12, 1e12)])
+def test_resistances_that_hold_a_joint_are_clipped_with_a_note(
+    tmp_path: Path, kind: str, damping: float, friction: float
+) -> None:
+    file = write_door(tmp_path, kind, damping=damping, friction=friction)
+    found = vkc.importing.import_object(file, tmp_path / "out")
+    resistance = found.object.resistance["hinge"]
+    expected = (min(damping, 1e4), min(friction, 1e4))
+    assert (resistance.damping, resistance.friction) == pytest.approx(expected)
+    notes = [note for note in found.notes if "10000 is used" in note]
+    assert len(notes) == (damping > 1e4) + (friction > 1e4)
+    assert all("joint 'hinge' states a " in note for note in notes)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_errors_about_generated_files_name_the_given_file(tmp_path: Path, kind: str) -> None:
+    """The generated files are gone when the error is read."""
+    near = {"urdf": 'xyz="1 0 0"', "xml": 'pos="1 0 0"', "sdf": "<pose>1 0 0"}[kind]
+    file = write_door(tmp_path, kind)
+    file.write_text(file.read_text().replace(near, near.replace("1", "3", 1)))
+    # The hinge is then 13.5 km from the middle of the object.
+    with pytest.raises(vkc.InputError, match=r"at most 10000, got 13500") as caught:
+        vkc.importing.import_object(file, tmp_path / "out", scale=9000.0)
+    assert (caught.value.file, caught.value.line) == (file, None)
+    assert str(tmp_path / "out") not in str(caught.value)

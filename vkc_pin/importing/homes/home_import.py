@@ -145,6 +145,7 @@ def import_home(  # noqa: PLR0913 - keyword options of a public call
     check_target(target, _COMMAND, force=check_bool(force, "force"))
     srdf_path = None if srdf is None else check_path(srdf, "srdf")
     original = read_description(path, free=True, packages=packages, arguments=arguments)
+    original = original.check_meshes(is_home=True)
     description = rename_for_scenes(original)
     contacts = read_home_contacts(path, srdf_path, original.links, description.links)
     description = move_root(description, pin.SE3(np.eye(3), np.array([0.0, 0.0, -floor])))
@@ -160,9 +161,8 @@ def import_home(  # noqa: PLR0913 - keyword options of a public call
             expected=expected,
             got=f"{home.shapes} fixed shapes",
         )
-    with write_folder_atomically(
-        target, force=True
-    ) as staging:  # `check_target` allowed replacing it
+    # `check_target` allowed replacing it
+    with write_folder_atomically(target, force=True, source=path) as staging:
         cache: PieceCache = {}
         names = [item.name for item in home.objects]
         taken = {FLOOR, *names}

@@ -38,6 +38,9 @@ __all__ = ["ImportProgress", "ImportedHomeObject", "write_object", "write_obstac
 T = TypeVar("T")
 _LOGGER = logging.getLogger(__name__)
 _PATIENCE = 2.0  # [s] before the first and between all progress lines
+# Triangles that take as long to cut, 0.4 ms each, as places for hands on a part are sought
+_PART_WORK = 2000.0
+_TRIANGLE_SIZE = 50.0  # [bytes] of a triangle in a binary STL file; text takes up to twice as much
 _LIFT = 0.2  # [m] by which a free object is lifted to test whether a hand can hold it
 
 
@@ -78,7 +81,10 @@ class ImportedHomeObject:
 
 
 class ImportProgress:
-    """Logs the number of the part at work, and the time left, every few seconds.
+    """Logs the part at work, and the time left, every few seconds.
+
+    The time left is that of the parts so far for as many triangles: most of it goes into cutting
+    meshes. Copies of a mesh count once.
 
     Args:
         home: The home, whose parts are objects and obstacles.
@@ -86,20 +92,41 @@ class ImportProgress:
 
     def __init__(self, home: Home) -> None:
         self.done = 0
-        self.total = len(home.objects) + sum(1 for _ in _iterate_obstacle_links(home))
+        meshes = set[tuple[Path, tuple[float, ...]]]()
+        parts = (*home.objects, *_iterate_obstacle_links(home))
+        self._sizes = [_measure_work(part, meshes) for part in parts]
         self._began = self._shown = time.perf_counter()
 
     def follow(self, parts: Iterable[T]) -> Iterator[T]:
-        """Yield parts, which have a `name`, and count them."""
+        """Yield the home's objects, or then its obstacles, which have a `name`, and count them."""
         for part in parts:
             now = time.perf_counter()
             if now - self._shown > _PATIENCE and self.done:
                 self._shown = now
-                left = (now - self._began) / self.done * (self.total - self.done)
-                about = f"part {self.done + 1} of {self.total}, about {left:.0f} s left"
+                done, left = sum(self._sizes[: self.done]), sum(self._sizes[self.done :])
+                seconds = (now - self._began) / done * left
+                about = f"part {self.done + 1} of {len(self._sizes)}, about {seconds:.0f} s left"
                 _LOGGER.info("%s: %s", getattr(part, "name", ""), about)
             yield part
             self.done += 1
+
+
+def _measure_work(part: HomeObject | Link, meshes: set[tuple[Path, tuple[float, ...]]]) -> float:
+    """Return about the number of triangles of a part's new meshes, and `_PART_WORK`.
+
+    Args:
+        part: The part.
+        meshes: Files and scales of meshes that count already, to which those of the part are added.
+    """
+    links = part.description.links.values() if isinstance(part, HomeObject) else (part,)
+    work = _PART_WORK
+    for solid in (solid for link in links for solid in link.solid):
+        if solid.triangles is not None:
+            work += len(solid.triangles.faces)
+        elif solid.file is not None and (solid.file, solid.size) not in meshes:
+            meshes.add((solid.file, solid.size))
+            work += solid.file.stat().st_size / _TRIANGLE_SIZE
+    return work
 
 
 def write_object(
@@ -123,7 +150,7 @@ def write_object(
     description = add_missing_limits(description)
     address = f"objects/{stem}/{stem}.yaml"
     yaml, urdf = folder / address, (folder / address).with_suffix(".urdf")
-    with tempfile.TemporaryDirectory() as scratch:
+    with tempfile.TemporaryDirectory(dir=folder) as scratch:
         trial = Path(scratch) / yaml.name if item.free else yaml
         write_urdf(description, trial.with_suffix(".urdf"))
         springs = description.joints.values()

@@ -6,12 +6,13 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
+from vkc_pin.importing.missing_meshes import MissingMesh, make_missing_error
 from vkc_pin.utils.arrays import MAX_COORDINATE, Floats
 from vkc_pin.world.files.meshes import load_mesh
 
@@ -33,6 +34,7 @@ Colour = tuple[float, float, float, float]
 WEIGHTLESS = (
     "no mass is stated: arm torques ignore weight and inertia, and simulation assumes a density"
 )
+_RESISTANCES = ("damping", "friction", "stiffness")
 _SIDES = 48  # facets of a cylinder mesh
 
 
@@ -156,12 +158,14 @@ class Description:
         links: Links by name.
         joints: Joints by the name of their child link.
         notes: Changes and omissions.
+        missing: Meshes that would collide and do not exist.
     """
 
     file: Path
     links: Mapping[str, Link]
     joints: Mapping[str, Joint]
     notes: tuple[str, ...] = ()
+    missing: tuple[MissingMesh, ...] = ()
 
     @property
     def root(self) -> str:
@@ -190,6 +194,57 @@ class Description:
     def is_massless(self) -> bool:
         """Whether no link has a mass."""
         return not any(link.inertia.mass > 0.0 for link in self.links.values())
+
+    def clip_resistances(self) -> Description:
+        """Return the object with resistances of joints up to `MAX_COORDINATE`, noting larger ones.
+
+        Larger ones state that a joint does not move.
+        """
+        joints, notes = dict(self.joints), list(self.notes)
+        for child, joint in self.joints.items():
+            stated = {name: getattr(joint, name) for name in _RESISTANCES}
+            for name, value in stated.items():
+                if value > MAX_COORDINATE:
+                    about = f"a {name} of {value:g}: {MAX_COORDINATE:g} is used"
+                    notes.append(f"joint '{joint.name}' states {about}")
+            clipped: dict[str, Any] = {
+                name: min(value, MAX_COORDINATE) for name, value in stated.items()
+            }
+            joints[child] = replace(joint, **clipped)
+        return replace(self, joints=joints, notes=tuple(notes))
+
+    def check_meshes(self, *, is_home: bool = False) -> Description:
+        """Return the object after checking that no mesh of its links is missing.
+
+        Args:
+            is_home: Whether visual meshes of links that do not move may be missing, which is noted.
+
+        Raises:
+            InputError: A mesh is missing.
+        """
+        of_links = [mesh for mesh in self.missing if mesh.link in self.links]
+        omitted = [
+            mesh
+            for mesh in of_links
+            if is_home and mesh.kind == "visual" and self.is_fixed(mesh.link)
+        ]
+        errors = [mesh.error for mesh in of_links if mesh not in omitted]
+        if errors:
+            raise make_missing_error(errors, self.file)
+        notes = [
+            f"link '{mesh.link}': there is no visual mesh {mesh.error.field}: left out, "
+            "although nothing collides in its place"
+            for mesh in omitted
+        ]
+        return replace(self, notes=(*self.notes, *notes), missing=())
+
+    def is_fixed(self, link: str) -> bool:
+        """Return whether only fixed joints connect a link with the root."""
+        while link in self.joints:
+            if self.joints[link].kind != "fixed":
+                return False
+            link = self.joints[link].parent
+        return True
 
     def subtree(self, link: str) -> set[str]:
         """Return a link and all its descendants."""

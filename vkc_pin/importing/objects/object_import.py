@@ -135,7 +135,8 @@ def read_description(
         warnings.simplefilter("always")
         description = _read_format(path, folders, given, free=free)
     notes = dict.fromkeys(str(warning.message) for warning in caught)
-    return dataclasses.replace(description, notes=(*description.notes, *notes))
+    description = dataclasses.replace(description, notes=(*description.notes, *notes))
+    return description.clip_resistances()
 
 
 def _read_format(
@@ -228,6 +229,7 @@ def import_object(  # noqa: PLR0913 - keyword options of a public call
             description, notes=description.notes + find_multiple_objects(description)
         )
     )
+    description = description.check_meshes()
     description = make_upright(merge_fixed_links(rename_for_scenes(description)), up)
     description, size = _scale_to_size(description, height, scale)
     description = _place_on_floor(description)
@@ -235,9 +237,8 @@ def import_object(  # noqa: PLR0913 - keyword options of a public call
         description = dataclasses.replace(description, notes=(*description.notes, WEIGHTLESS))
     description = decompose_links(description, load_surfaces(description))
     description = add_missing_limits(description)
-    with write_folder_atomically(
-        target, force=True
-    ) as staging:  # `check_target` allowed replacing it
+    # `check_target` allowed replacing it
+    with write_folder_atomically(target, force=True, source=path) as staging:
         yaml, urdf, picture = (
             staging / f"{name}.yaml",
             staging / f"{name}.urdf",

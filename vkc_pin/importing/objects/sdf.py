@@ -14,6 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.importing.missing_meshes import MissingMesh
 from vkc_pin.importing.objects.description import (
     Description,
     Joint,
@@ -71,7 +72,7 @@ def read_object_sdf(
 class _Reader:
     def __init__(self, file: Path, packages: Mapping[str, Path]) -> None:
         self.file, self.packages, self.count = file, packages, 0
-        self.notes, self.missing = list[str](), list[InputError]()
+        self.notes, self.missing = list[str](), list[MissingMesh]()
         root, rules = self._load(file)
         worlds, models = root.findall("world"), root.findall("model")
         if len(worlds) + len(models) != 1:
@@ -299,8 +300,8 @@ class _Reader:
                     child=names[name],
                     placement=frames[name],
                 )
-        self._check_missing()
-        return Description(self.file, found_links, found_joints, tuple(self.notes))
+        notes, missing = tuple(self.notes), tuple(self.missing)
+        return Description(self.file, found_links, found_joints, notes, missing)
 
     def _connect(
         self,
@@ -456,7 +457,7 @@ class _Reader:
         if (dynamics := element.find("dynamics")) is None:
             return {}
         damping, friction, stiffness, rest = (
-            scope.read_numbers(dynamics, key, 1, "0", name)[0]
+            scope.read_numbers(dynamics, key, 1, "0", name, largest=math.inf)[0]
             for key in ("damping", "friction", "spring_stiffness", "spring_reference")
         )
         return {
@@ -479,22 +480,10 @@ class _Reader:
             collision, about = (), "its visual shapes collide instead"
             self.notes += [f"link '{local}': {error}: {about}" for error in lost["collision"]]
         elif lost["collision"] or (lost["visual"] and not visual and not collision):
-            self.missing += lost["collision"] or lost["visual"]
+            lost_kind = "collision" if lost["collision"] else "visual"
+            self.missing += [MissingMesh(name, lost_kind, error) for error in lost[lost_kind]]
         self.notes += [f"link '{local}': {error}: left out" for error in lost["visual"]]
         return Link(name, visual, collision, self._read_inertia(scope, element, base, local))
-
-    def _check_missing(self) -> None:
-        """Raise an error about all meshes that are missing and that nothing can replace."""
-        if len(self.missing) == 1:
-            raise self.missing[0]
-        if self.missing:
-            listed = ", ".join(dict.fromkeys(str(error.field) for error in self.missing))
-            raise InputError(
-                f"{len(self.missing)} meshes do not exist: {listed}",
-                file=self.file,
-                expected="mesh files, or visual shapes of the same links",
-                got=self.missing[0].got,
-            )
 
     def _read_shapes(
         self,

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
-from vkc_pin.importing.missing_meshes import replace_missing_meshes
+from vkc_pin.importing.missing_meshes import replace_found_meshes
 from vkc_pin.importing.objects.description import (
     Description,
     Joint,
@@ -69,7 +69,8 @@ def read_object_urdf(
     kinds = {joint.get("name", ""): joint.get("type", "") for joint in root.findall("joint")}
     check_tree(file, root)
     urdf = UrdfFile(file.resolve(), "", root, packages or {})
-    notes += replace_missing_meshes(urdf, every_link=True)
+    replaced, missing = replace_found_meshes(urdf, every_link=True)
+    notes += replaced
     names = _find_shape_names(root)
     parts: dict[str, dict[str, list[Part]]] = {
         kind: {link: [] for link in urdf.links} for kind in ("visual", "collision")
@@ -103,7 +104,8 @@ def read_object_urdf(
     for joint in root.findall("joint"):
         name = joint.get("name", "")
         joints.append(_read_joint(file, joint, kinds[name], stated[name]))
-    return Description(file, links, {joint.child: joint for joint in joints}, tuple(notes))
+    by_child = {joint.child: joint for joint in joints}
+    return Description(file, links, by_child, tuple(notes), tuple(missing))
 
 
 def _find_shape_names(root: ElementTree.Element) -> dict[tuple[str, str], str]:
@@ -163,6 +165,10 @@ def _make_placement(origin: tuple[tuple[float, ...], tuple[float, ...]]) -> pin.
     return pin.SE3(pin.rpy.rpyToMatrix(*angles), np.array(position))
 
 
+def _parse_resistance(file: Path, dynamics: ElementTree.Element, key: str, name: str) -> float:
+    return parse_numbers(file, dynamics, key, 1, default="0", where=name, largest=math.inf)[0]
+
+
 def _read_joint(
     file: Path, element: ElementTree.Element, kind: str, limits: tuple[float, float] | None
 ) -> Joint:
@@ -171,16 +177,14 @@ def _read_joint(
     direction = np.array([1.0, 0.0, 0.0])
     if axis is not None and kind not in ("fixed", "floating"):
         direction = np.array(parse_numbers(file, axis, "xyz", 3, default="1 0 0", where=name))
-    velocity = (
-        parse_numbers(file, limit, "velocity", 1, default="0", where=name)[0]
-        if limit is not None
-        else 0.0
-    )
+    velocity = 0.0
+    if limit is not None:
+        (velocity,) = parse_numbers(
+            file, limit, "velocity", 1, default="0", where=name, largest=math.inf
+        )
     dynamics = element.find("dynamics")
     resistance = {
-        key: 0.0
-        if dynamics is None
-        else max(0.0, parse_numbers(file, dynamics, key, 1, default="0", where=name)[0])
+        key: 0.0 if dynamics is None else max(0.0, _parse_resistance(file, dynamics, key, name))
         for key in ("damping", "friction")
     }
     ends = [

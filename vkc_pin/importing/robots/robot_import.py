@@ -167,9 +167,8 @@ def import_robot(  # noqa: PLR0913 - keyword options of a public call
     }
     srdf_path = None if srdf is None else check_path(srdf, "srdf")
     check_target(target, "import-robot", force=check_bool(force, "force"))
-    with write_folder_atomically(
-        target, force=True
-    ) as staging:  # `check_target` allowed replacing it
+    # `check_target` allowed replacing it
+    with write_folder_atomically(target, force=True, source=path) as staging:
         source = read_source(
             path, staging / ".meshes", packages=places, arguments=given_arguments, srdf=srdf_path
         )

@@ -212,15 +212,19 @@ def _walk_files(folder: str | Path) -> Iterator[os.DirEntry[str]]:
 
 
 @contextlib.contextmanager
-def write_folder_atomically(path: str | Path, *, force: bool = False) -> Iterator[Path]:
+def write_folder_atomically(
+    path: str | Path, *, force: bool = False, source: Path | None = None
+) -> Iterator[Path]:
     """Yield a new folder, which replaces `path` on success and is removed on failure.
 
     It gets a list of its files, so that a later call can replace it safely. The new folder has the
-    name of `path`, and errors name files in `path` instead.
+    name of `path`. Errors about files in it, which are gone, name `source` instead, or files in
+    `path`.
 
     Args:
         path: The folder, created with its parents.
         force: Replace an existing folder that is empty or written by this function.
+        source: File of which the folder is made.
     """
     target = Path(os.path.realpath(check_path(path, "path", "a folder")))
     _check_target(target, path, force)
@@ -236,9 +240,11 @@ def write_folder_atomically(path: str | Path, *, force: bool = False) -> Iterato
             _write_manifest(staging)
             _replace_folder(target, staging)
     except InputError as error:
-        error.args = tuple(str(part).replace(str(staging), str(path)) for part in error.args)
-        if error.file is not None:
-            error.file = type(error.file)(str(error.file).replace(str(staging), str(path)))
+        if source is None:
+            _rename_files(error, re.compile(re.escape(str(staging))), str(path))
+        else:
+            inside = re.compile(rf"{re.escape(str(staging))}(/[^:\s]*)?(:\d+)?")
+            _rename_files(error, inside, str(source))
         raise
     except OSError as error:
         if error.errno not in _FULL_DISK:
@@ -246,6 +252,18 @@ def write_folder_atomically(path: str | Path, *, force: bool = False) -> Iterato
         raise InputError("cannot write this", file=path, got=error.strerror) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _rename_files(error: InputError, pattern: re.Pattern[str], name: str) -> None:
+    """Replace file names, also with lines, in an error."""
+    error.args = tuple(pattern.sub(lambda _: name, str(part)) for part in error.args)
+    error.problem = pattern.sub(lambda _: name, error.problem)
+    if error.file is not None:
+        old = str(error.file)
+        new = pattern.sub(lambda _: name, old)
+        error.file = type(error.file)(new)
+        if new == name:
+            error.line = None  # it counts lines of the other file
 
 
 def _check_target(target: Path, path: str | Path, force: bool) -> None:

@@ -93,7 +93,7 @@ class ImportProgress:
     def __init__(self, home: Home) -> None:
         self.done = 0
         meshes = set[tuple[Path, tuple[float, ...]]]()
-        parts = (*home.objects, *_iterate_obstacle_links(home))
+        parts: list[HomeObject | Link] = [*home.objects, *_iterate_obstacle_links(home)]
         self._sizes = [_measure_work(part, meshes) for part in parts]
         self._began = self._shown = time.perf_counter()
 

@@ -74,10 +74,12 @@ def load_mesh(
 ) -> trimesh.Trimesh:
     """Return a mesh file as one mesh of all its objects, in the file's frame [m].
 
+    glTF files are turned from y up to z up.
+
     Args:
         path: OBJ, STL, PLY, OFF, glTF or COLLADA file.
-        scale: Factor from the file's unit to [m], or one for each axis. COLLADA files state their
-            unit, which counts as well.
+        scale: Factor from the file's unit to [m], or one for each axis, of glTF files after they
+            are turned. COLLADA files state their unit, which counts as well.
         submesh: Name of an object, group or node, to read it alone.
 
     Raises:

@@ -101,3 +101,14 @@ def test_lerobot_layout_has_colour_images(dataset: Dataset) -> None:
             of_colours = getattr(expected, key)(axis=(0, 1, 2)) / 255.0
             np.testing.assert_allclose(np.ravel(stats[name][key]), of_colours, atol=1e-9)
         assert stats[name]["count"] == [len(expected)]
+        for key, fraction in (("q01", 0.01), ("q50", 0.5), ("q99", 0.99)):
+            per_episode = [
+                np.quantile(each[f"{camera}_image"], fraction, axis=(0, 1, 2)) / 255.0
+                for each in pictures
+            ]
+            lengths = [len(each[f"{camera}_image"]) for each in pictures]
+            of_colours = np.average(per_episode, axis=0, weights=lengths)
+            assert np.shape(stats[name][key]) == (3, 1, 1)
+            np.testing.assert_allclose(np.ravel(stats[name][key]), of_colours, atol=1.0 / 255.0)
+        described = json.loads(table.schema.metadata[b"huggingface"])["info"]["features"]
+        assert described[name] == {"_type": "Image"}

@@ -274,6 +274,79 @@ def test_modified_lerobot_files_are_reported(
     assert any(expected in problem for problem in found), found
 
 
+def rewrite_as_older(folder: Path, *, but: str = "") -> None:
+    """Remove what older files lack: quantiles, but of a feature, and descriptions of columns."""
+    parquet = pytest.importorskip("pyarrow.parquet")
+    names = ("q01", "q10", "q50", "q90", "q99")
+    file = folder / FRAMES
+    with parquet.ParquetFile(file) as opened:
+        tables = [opened.read_row_group(k) for k in range(opened.num_row_groups)]
+    with parquet.ParquetWriter(file, tables[0].schema.remove_metadata()) as writer:
+        for table in tables:
+            writer.write_table(table.replace_schema_metadata(None))
+    file = folder / "meta/episodes/chunk-000/file-000.parquet"
+    table = parquet.read_table(file)
+    is_new = [name.endswith(names) and name != f"stats/{but}/q50" for name in table.column_names]
+    old = [name for name, new in zip(table.column_names, is_new, strict=True) if not new]
+    parquet.write_table(table.select(old), file)
+    file = folder / "meta/stats.json"
+    stats = json.loads(file.read_text())
+    for feature, own in stats.items():
+        for name in names:
+            if feature != but:
+                del own[name]
+    file.write_text(json.dumps(stats))
+
+
+def test_older_lerobot_files_pass(copy: Path) -> None:
+    rewrite_as_older(copy / "lerobot" / "husky_ur5e")
+    assert check_lerobot((str(copy), "husky_ur5e")) == []
+
+
+def test_quantiles_of_some_features_only_are_reported(copy: Path) -> None:
+    rewrite_as_older(copy / "lerobot" / "husky_ur5e", but="action")
+    problems = check_lerobot((str(copy), "husky_ur5e"))
+    assert any("other columns" in problem for problem in problems), problems
+
+
+def describe_columns_wrongly(folder: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    file = folder / FRAMES
+    with parquet.ParquetFile(file) as opened:
+        tables = [opened.read_row_group(k) for k in range(opened.num_row_groups)]
+    wrong = {"huggingface": '{"info": {"features": {}}}'}
+    tables = [table.replace_schema_metadata(wrong) for table in tables]
+    with parquet.ParquetWriter(file, tables[0].schema) as writer:
+        for table in tables:
+            writer.write_table(table)
+
+
+def change_quantile(folder: Path, bins: float = 5.0) -> None:
+    file = folder / "meta/stats.json"
+    stats = json.loads(file.read_text())
+    own = stats["observation.state"]
+    own["q99"][0] += bins / 5000.0 * np.max(np.subtract(own["max"], own["min"]))
+    file.write_text(json.dumps(stats))
+
+
+def test_quantiles_of_another_machine_pass(copy: Path) -> None:
+    """A value that is rounded differently may be in the next bin of a histogram."""
+    change_quantile(copy / "lerobot" / "husky_ur5e", 1.0)
+    assert check_lerobot((str(copy), "husky_ur5e")) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [(describe_columns_wrongly, "huggingface: the fields"), (change_quantile, "stats.json: ")],
+)
+def test_wrong_descriptions_and_quantiles_are_reported(
+    copy: Path, change: Callable[[Path], None], expected: str
+) -> None:
+    change(copy / "lerobot" / "husky_ur5e")
+    problems = check_lerobot((str(copy), "husky_ur5e"))
+    assert any(expected in problem for problem in problems), problems
+
+
 def test_valid_dataset_passes_and_its_page_reports_success(
     copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

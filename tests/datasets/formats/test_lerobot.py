@@ -93,6 +93,73 @@ def test_statistics_cover_all_frames(root: Path) -> None:
     assert found["count"] == [len(values)]
 
 
+FRACTIONS = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+
+
+def estimate_quantile(column: np.ndarray, fraction: float) -> float:
+    """Return LeRobot's estimate: where a histogram of 5000 bins reaches the fraction."""
+    counts, edges = np.histogram(column, np.linspace(column.min(), column.max() + 1e-10, 5001))
+    below = 0.0
+    for count, low, high in zip(counts, edges, edges[1:], strict=False):
+        if below + count >= fraction * len(column):
+            part = (fraction * len(column) - below) / count
+            return float(low + part * (high - low))
+        below += count
+    return float(column.max())
+
+
+def test_every_episode_has_quantiles(root: Path) -> None:
+    """Policies that normalise by quantiles refuse datasets without, and so do resumed recordings.
+
+    LeRobot writes them in this order; its bins have a width of 1/5000 of the range.
+    """
+    table = pq.read_table(root / "data/chunk-000/file-000.parquet")
+    rows = pq.read_table(root / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    order = ["min", "max", "mean", "std", "count", *FRACTIONS]
+    episodes = np.array(table["episode_index"].to_pylist())
+    for name in table.column_names:
+        values = np.array(table[name].to_pylist(), float).reshape(len(table), -1)
+        found = [key for key in rows[0] if key.startswith(f"stats/{name}/")]
+        assert found == [f"stats/{name}/{key}" for key in order]
+        for number, row in enumerate(rows):
+            own = values[episodes == number]
+            bins = np.ptp(own, axis=0) / 5000.0 + 1e-7
+            for key, fraction in FRACTIONS.items():
+                stored = np.array(row[f"stats/{name}/{key}"])
+                expected = [estimate_quantile(column, fraction) for column in own.T]
+                assert (np.abs(stored - expected) <= 2.0 * bins).all(), (name, number, key)
+                # The estimate is between the two samples next to that fraction.
+                for method, sign in (("lower", 1.0), ("higher", -1.0)):
+                    count = len(own)
+                    low = max(fraction - 1.0 / count, 0.0) if sign > 0 else fraction + 1.0 / count
+                    bound = np.quantile(own, min(low, 1.0), axis=0, method=method)
+                    assert (sign * (stored - bound) >= -2.0 * bins).all(), (name, number, key)
+
+
+def test_quantiles_of_all_episodes_are_means_by_their_lengths(root: Path) -> None:
+    """This is how LeRobot merges them when an episode is added."""
+    stats = json.loads((root / "meta/stats.json").read_text())
+    rows = pq.read_table(root / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    lengths = [row["length"] for row in rows]
+    for name, own in stats.items():
+        for key in FRACTIONS:
+            parts = [row[f"stats/{name}/{key}"] for row in rows]
+            expected = np.average(parts, axis=0, weights=lengths)
+            np.testing.assert_allclose(own[key], expected, atol=1e-12)
+
+
+def test_columns_are_described_for_readers_of_parquet(root: Path) -> None:
+    """The package `datasets` reads features from the schema, as of files that LeRobot writes."""
+    info = load_info(root)
+    schema = pq.read_schema(root / "data/chunk-000/file-000.parquet")
+    features = json.loads(schema.metadata[b"huggingface"])["info"]["features"]
+    assert list(features) == schema.names
+    number = {"dtype": "float32", "_type": "Value"}
+    size = info["features"]["action"]["shape"][0]
+    assert features["action"] == {"feature": number, "length": size, "_type": "List"}
+    assert features["index"] == {"dtype": "int64", "_type": "Value"}
+
+
 def test_rate_must_be_a_whole_number(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="whole numbers of frames"):
         generate({**SMALL, "rate": 12.5}, 1, tmp_path / "out", lerobot=True)

@@ -35,6 +35,7 @@ _SIZE = 100  # [MB] of a file; files are cut before they get there
 _ROWS = 200_000  # frames of a file
 _IMAGES = 90_000_000  # bytes of images in a file, after which the next one is begun
 _TOLERANCE = 1e-5  # of numbers made on another machine, relative and absolute
+_SCHEMA_KEY = "huggingface"  # metadata of the package `datasets` in the schema of a Parquet file
 _SEEN = "_image"  # end of the names of what becomes an image
 _KINDS = {
     "timestamp": "float32",
@@ -51,6 +52,9 @@ _COLUMNS = {
     "action": ("actions",),
 }
 """Feature → its parts among the samples of an episode."""
+_QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+_BINS = 5000  # of the histograms for quantiles, as in LeRobot
+_PADDING = 1e-10  # beyond the smallest and the largest value, as in LeRobot
 
 
 def require_pyarrow(rate: float) -> Any:
@@ -182,14 +186,12 @@ class _Writer:
             "index": np.arange(self.frames, self.frames + count),
             "task_index": np.full(count, task),
         }
-        stats = {name: _statistics(values) for name, values in columns.items()}
+        stats = {name: _describe_rows(values) for name, values in columns.items()}
         size = 0
         for name, pixels in _pictures(episode):
             shape, axes = list(pixels.shape[1:]), ["height", "width", "channels"]
             self.features[name] = {"dtype": "image", "shape": shape, "names": axes}
-            own = _statistics(pixels.reshape(-1, 3) / 255.0)
-            stats[name] = {key: value.reshape(-1, 1, 1) for key, value in own.items()}
-            stats[name]["count"] = np.array([count])
+            stats[name] = _describe_images(pixels)
             columns[name] = [
                 {"bytes": _png(one), "path": f"frame-{k:06d}.png"} for k, one in enumerate(pixels)
             ]
@@ -234,7 +236,9 @@ class _Writer:
             elif feature["shape"] != [1]:
                 kind = arrow.list_(kind, feature["shape"][0])
             fields.append((name, kind))
-        tables, schema = [], arrow.schema(fields)
+        described = {"info": {"features": self._describe_features()}}
+        schema = arrow.schema(fields, metadata={_SCHEMA_KEY: json.dumps(described)})
+        tables = []
         for columns in self._waiting:
             arrays = []
             for name, kind in fields:
@@ -248,6 +252,19 @@ class _Writer:
             tables.append(arrow.Table.from_arrays(arrays, schema=schema))
         self._write_tables(self.folder / _DATA.format(**place), tables)
         self._waiting, self._frames_waiting, self._bytes, self.count = [], 0, 0, self.count + 1
+
+    def _describe_features(self) -> dict[str, Any]:
+        """Describe the columns as the package `datasets` does: readers then decode images."""
+        found: dict[str, Any] = {}
+        for name, feature in self.features.items():
+            value = {"dtype": feature["dtype"], "_type": "Value"}
+            if feature["dtype"] == "image":
+                found[name] = {"_type": "Image"}
+            elif feature["shape"] == [1]:
+                found[name] = value
+            else:
+                found[name] = {"feature": value, "length": feature["shape"][0], "_type": "List"}
+        return found
 
     def _close(self) -> None:
         """Write pending frames, tables and statistics."""
@@ -287,6 +304,8 @@ class _Writer:
 class _Comparison(_Writer):
     """Compares files with what would be written.
 
+    Older datasets have no quantiles, and no description of their columns.
+
     Attributes:
         found: Differences.
         files: All files.
@@ -299,7 +318,13 @@ class _Comparison(_Writer):
 
     def _write_json(self, path: Path, content: Any) -> None:
         self.files.append(path)
-        self._compare(path, "", parse_json(read_text(path, "JSON"), path), content)
+        stored = parse_json(read_text(path, "JSON"), path)
+        if path.name == "stats.json" and not _has_quantiles(stored):
+            content = {
+                name: {key: value for key, value in own.items() if key not in _QUANTILES}
+                for name, own in content.items()
+            }
+        self._compare(path, "", stored, content)
 
     def _write_tables(self, path: Path, tables: Sequence[Any]) -> None:
         self.files.append(path)
@@ -310,52 +335,92 @@ class _Comparison(_Writer):
             with parquet.ParquetFile(path) as file:
                 groups = [file.metadata.row_group(k).num_rows for k in range(file.num_row_groups)]
                 sizes = [table.num_rows for table in tables]
+                names = file.schema_arrow.names
+                if not any(map(_is_quantile, names)):
+                    kept = [name for name in tables[0].column_names if not _is_quantile(name)]
+                    tables = [table.select(kept) for table in tables]
                 if groups != sizes or not file.schema_arrow.equals(tables[0].schema):
                     raise InputError(
                         "other columns or sizes",
                         file=path,
                         expected=f"row groups of {sizes} with {tables[0].schema.names}",
-                        got=f"{groups[:100]} with {file.schema_arrow.names[:100]}",
+                        got=f"{groups[:100]} with {names[:100]}",
                     )
+                self._compare_descriptions(path, file.schema_arrow, tables[0].schema)
                 for k, table in enumerate(tables):
                     stored = file.read_row_group(k)
                     for name in table.column_names:
                         column, truth = stored[name], table[name]
                         if not column.equals(truth):
                             where = f"row group {k}: {name}"
-                            self._compare(path, where, column.to_pylist(), truth.to_pylist())
+                            statistics = table.to_pydict() if _is_quantile(name) else {}
+                            tolerance = _choose_tolerance(name, statistics)
+                            self._compare(
+                                path, where, column.to_pylist(), truth.to_pylist(), tolerance
+                            )
         except (arrow.ArrowException, OSError, MemoryError) as error:
             problem, expected = "not a Parquet file, or a damaged one", "a file of the dataset"
             raise InputError(problem, file=path, expected=expected, got=str(error)) from error
 
-    def _compare(self, path: Path, where: str, stored: Any, truth: Any) -> None:
-        """Record the first difference of plain data, numbers up to rounding."""
-        if difference := _find_difference(stored, truth):
+    def _compare_descriptions(self, path: Path, stored: Any, truth: Any) -> None:
+        """Compare what the schemas of a file say about columns, if both say anything."""
+        key = _SCHEMA_KEY.encode()
+        metadata = [schema.metadata or {} for schema in (stored, truth)]
+        if all(key in one for one in metadata):
+            texts = [one[key].decode(errors="replace") for one in metadata]
+            described, expected = (parse_json(text, path) for text in texts)
+            self._compare(path, _SCHEMA_KEY, described, expected)
+
+    def _compare(
+        self, path: Path, where: str, stored: Any, truth: Any, tolerance: float = _TOLERANCE
+    ) -> None:
+        """Record the first difference of plain data, numbers up to a tolerance."""
+        if difference := _find_difference(stored, truth, tolerance):
             name = path.relative_to(self.folder)
             self.found.append(": ".join(part for part in (str(name), where, difference) if part))
 
 
-def _find_difference(stored: Any, truth: Any) -> str:
+def _has_quantiles(stored: Any) -> bool:
+    """Return whether the content of stats.json has a quantile of any feature."""
+    features = stored.values() if isinstance(stored, dict) else ()
+    return any(not _QUANTILES.keys().isdisjoint(own) for own in features if isinstance(own, dict))
+
+
+def _choose_tolerance(name: str, statistics: Mapping[str, Any]) -> float:
+    """Return the tolerance of a column or field, given those beside it by name.
+
+    A value that is rounded differently may be in the next bin of the histogram for quantiles.
+    """
+    if not _is_quantile(name):
+        return _TOLERANCE
+    begin = name.removesuffix(name.rpartition("/")[2])
+    low, high = (np.array(statistics[begin + end]) for end in ("min", "max"))
+    return _TOLERANCE + 2.0 / _BINS * float(np.max(high - low))
+
+
+def _find_difference(stored: Any, truth: Any, tolerance: float = _TOLERANCE) -> str:
     """Return the first difference of plain data as text; none: an empty one."""
     if isinstance(truth, dict) and isinstance(stored, dict):
         if set(stored) != set(truth):
             return f"the fields {format_value(list(stored))}, not {format_value(list(truth))}"
-        pairs = [(stored[name], truth[name]) for name in truth]
+        pairs = [(stored[name], truth[name], _choose_tolerance(name, truth)) for name in truth]
     elif isinstance(truth, list) and isinstance(stored, list):
         if len(stored) != len(truth):
             return f"{len(stored)} entries, not {len(truth)}"
-        pairs = list(zip(stored, truth, strict=True))
+        pairs = [(*pair, tolerance) for pair in zip(stored, truth, strict=True)]
+    elif _agrees(stored, truth, tolerance):
+        return ""
     else:
-        return "" if _agrees(stored, truth) else f"{format_value(stored)}, not {truth!r:.300}"
+        return f"{format_value(stored)}, not {truth!r:.300}"
     return next(filter(None, (_find_difference(*pair) for pair in pairs)), "")
 
 
-def _agrees(stored: Any, truth: Any) -> bool:
-    """Return whether two values agree, numbers up to rounding, and images pixel by pixel."""
+def _agrees(stored: Any, truth: Any, tolerance: float) -> bool:
+    """Return whether two values agree, numbers up to a tolerance, and images pixel by pixel."""
     if isinstance(truth, bytes) and isinstance(stored, bytes):
         return stored == truth or _decode(stored, truth) == _decode(truth, truth)
     if isinstance(truth, float) and isinstance(stored, float):
-        return bool(np.isclose(stored, truth, rtol=_TOLERANCE, atol=_TOLERANCE))
+        return bool(np.isclose(stored, truth, rtol=_TOLERANCE, atol=tolerance))
     return bool(type(stored) is type(truth) and stored == truth)
 
 
@@ -388,16 +453,66 @@ def _png(pixels: Any) -> bytes:
     return buffer.getvalue()
 
 
-def _statistics(values: Any) -> dict[str, Floats]:
-    """Return minimum, maximum, mean and standard deviation of every column, and the row count."""
-    rows = np.asarray(values, float).reshape(len(values), -1)
-    return {
-        "min": rows.min(axis=0),
-        "max": rows.max(axis=0),
-        "mean": rows.mean(axis=0),
-        "std": rows.std(axis=0),
-        "count": np.array([len(rows)]),
+def _describe_rows(rows: Any) -> dict[str, Floats]:
+    """Return the statistics of every column, and the number of rows, (N, n) or (N,)."""
+    columns = rows.reshape(len(rows), -1).T
+    weights = np.ones(len(rows))
+    return _collect([_describe_values(column, weights) for column in columns], len(rows))
+
+
+def _describe_images(pixels: Any) -> dict[str, Floats]:
+    """Return the statistics of every colour from 0 to 1, and the number of images.
+
+    Args:
+        pixels: Images, shape (N, height, width, 3).
+    """
+    colours = []
+    for colour in np.moveaxis(pixels, -1, 0):
+        weights = np.bincount(colour.ravel(), minlength=256)
+        levels = np.flatnonzero(weights).astype(np.uint8)
+        colours.append(_describe_values(levels, weights[levels]))
+    found = _collect(colours, len(pixels))
+    scaled = {name: value.reshape(-1, 1, 1) / 255.0 for name, value in found.items()}
+    return {**scaled, "count": found["count"]}
+
+
+def _collect(columns: Sequence[Mapping[str, float]], count: int) -> dict[str, Floats]:
+    """Return name → values of all columns, in the order of LeRobot's tables."""
+    found = {name: np.array([column[name] for column in columns]) for name in columns[0]}
+    quantiles = {name: found.pop(name) for name in _QUANTILES}
+    return {**found, "count": np.array([count]), **quantiles}
+
+
+def _describe_values(values: Any, weights: Any) -> dict[str, float]:
+    """Return the statistics of values with their numbers of occurrences.
+
+    Quantiles are those of LeRobot's `compute_stats.py`: of a histogram of 5000 bins, within each of
+    which values are evenly distributed, in single precision if the values are.
+    """
+    exact = values.astype(float)
+    mean = np.average(exact, weights=weights)
+    found = {
+        "min": exact.min(),
+        "max": exact.max(),
+        "mean": mean,
+        "std": np.sqrt(np.average((exact - mean) ** 2, weights=weights)),
     }
+    coarse = values.astype(np.result_type(values.dtype, np.float32))
+    edges = np.linspace(coarse.min() - _PADDING, coarse.max() + _PADDING, _BINS + 1)
+    counts, _ = np.histogram(coarse, bins=edges, weights=weights)
+    sums = np.cumsum(counts)
+    for name, fraction in _QUANTILES.items():
+        target = fraction * sums[-1]
+        k = int(np.searchsorted(sums, target))
+        part = (target - sums[k] + counts[k]) / counts[k]
+        # LeRobot takes the lower edge if the value is in the first bin.
+        found[name] = edges[k] + (part if k > 0 else 0.0) * (edges[k + 1] - edges[k])
+    return found
+
+
+def _is_quantile(name: str) -> bool:
+    """Return whether a column has quantiles, such as `stats/action/q50`."""
+    return name.rpartition("/")[2] in _QUANTILES
 
 
 _PANDAS = {
@@ -429,10 +544,14 @@ def _merge_statistics(parts: list[dict[str, Floats]]) -> dict[str, list[float]]:
     total = counts.sum()  # images of a camera have one size: frames weigh as pixels do
     mean = (means * counts).sum(axis=0) / total
     variance = ((deviations**2 + (means - mean) ** 2) * counts).sum(axis=0) / total
-    return {
-        "min": np.min([part["min"] for part in parts], axis=0).tolist(),
-        "max": np.max([part["max"] for part in parts], axis=0).tolist(),
-        "mean": mean.tolist(),
-        "std": np.sqrt(variance).tolist(),
-        "count": [int(total)],
+    merged = {
+        "min": np.min([part["min"] for part in parts], axis=0),
+        "max": np.max([part["max"] for part in parts], axis=0),
+        "mean": mean,
+        "std": np.sqrt(variance),
+        "count": np.array([int(total)]),
     }
+    for name in _QUANTILES:  # as LeRobot merges them, since frames are not kept
+        quantiles = np.array([part[name] for part in parts])
+        merged[name] = (quantiles * counts).sum(axis=0) / total
+    return {name: value.tolist() for name, value in merged.items()}

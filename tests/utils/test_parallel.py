@@ -1,6 +1,9 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +11,7 @@ import pytest
 from helpers.expected_errors import expect_error
 from helpers.tasks import crash_once, double, hang, identify_worker
 
+from vkc_pin.utils.interrupt import start_without_interrupt
 from vkc_pin.utils.parallel import MAX_CRASHES, CrashedTask, require_dask, run_tasks
 
 
@@ -90,3 +94,59 @@ def test_schedulers_without_workers_are_reported(monkeypatch: pytest.MonkeyPatch
             run_tasks(double, make_tasks(3), scheduler=cluster.scheduler_address, tell=tell)
         ) == {"0": 0, "1": 2, "2": 4}
     assert sum("no workers" in line for line in lines) == 1
+
+
+INTERRUPTED = """
+import os, signal, threading, time
+import psutil
+from vkc_pin.utils.parallel import run_tasks
+
+def interrupt():
+    while len(psutil.Process().children(recursive=True)) < {processes}:
+        time.sleep(0.005)
+    os.killpg(0, signal.SIGINT)
+
+if __name__ == "__main__":
+    threading.Thread(target=interrupt, daemon=True).start()
+    try:
+        for _ in run_tasks(time.sleep, ((str(k), 1.0) for k in range(600)), jobs=2, dask=True):
+            print("a result", flush=True)
+    except KeyboardInterrupt:
+        print("interrupted", flush=True)
+    lines = [" ".join(child.cmdline()) for child in psutil.Process().children()]
+    assert not any("spawn_main" in line for line in lines), lines
+"""
+
+
+@pytest.mark.parametrize("processes", [1, 2, 3])
+def test_ctrl_c_while_workers_start_is_not_lost(processes: int, tmp_path: Path) -> None:
+    """Ctrl-C reaches all processes of the terminal. Only the first one takes notice of it."""
+    pytest.importorskip("distributed")
+    script = tmp_path / "script.py"
+    script.write_text(INTERRUPTED.format(processes=processes))
+    done = subprocess.run(
+        [sys.executable, str(script)],
+        capture_output=True,
+        text=True,
+        start_new_session=True,
+        timeout=120,
+    )
+    assert done.stdout == "interrupted\n", done
+    assert "Traceback" not in done.stderr, done.stderr
+    assert done.returncode == 0
+
+
+def test_ctrl_c_is_deferred_while_processes_start() -> None:
+    code = [sys.executable, "-c", "import signal; signal.raise_signal(signal.SIGINT)"]
+    statuses: list[int] = []
+
+    def start() -> None:
+        with start_without_interrupt():
+            signal.raise_signal(signal.SIGINT)
+            statuses.append(subprocess.run(code, capture_output=True).returncode)
+
+    with pytest.raises(KeyboardInterrupt):
+        start()
+    assert statuses == [0]
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any
 
-__all__ = ["defer_interrupt", "handle_interrupt", "raise_on_interrupt"]
+__all__ = ["defer_interrupt", "handle_interrupt", "raise_on_interrupt", "start_without_interrupt"]
 
 
 @contextlib.contextmanager
@@ -43,6 +43,21 @@ def defer_interrupt() -> Iterator[None]:
     finally:
         if pressed:
             signal.raise_signal(signal.SIGINT)
+
+
+@contextlib.contextmanager
+def start_without_interrupt() -> Iterator[None]:
+    """Defer Ctrl-C while processes and threads are started, none of which gets it then or later.
+
+    They inherit the mask of blocked signals. Ignoring the signal would lose Ctrl-C here as well,
+    and a handler is not inherited.
+    """
+    with defer_interrupt():
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextlib.contextmanager

@@ -20,7 +20,7 @@ from functools import cache
 from typing import Any
 
 from vkc_pin.errors import InputError, VkcError, format_value
-from vkc_pin.utils.interrupt import handle_interrupt
+from vkc_pin.utils.interrupt import start_without_interrupt
 from vkc_pin.utils.optional_imports import import_optional
 
 __all__ = [
@@ -250,7 +250,7 @@ def _open_client(jobs: int, scheduler: str | None) -> Generator[tuple[Any, Any]]
     }
     with dask.config.set(settings), contextlib.ExitStack() as stack:
         if scheduler is None:
-            with handle_interrupt(signal.SIG_IGN):  # inherited by the processes
+            with start_without_interrupt():
                 cluster = stack.enter_context(
                     LocalCluster(
                         n_workers=jobs,

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import dataclasses
+import html
+import itertools
 import json
 import os
 import re
@@ -18,6 +20,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
+import umsgpack
 import zmq
 from helpers import browser
 from helpers.fake_plan import HINGE
@@ -273,6 +276,112 @@ def test_server_accepts_only_local_clients(viewer: Any) -> None:
             socket.create_connection(("127.0.0.2", number), timeout=20)
 
 
+def connect_page(port: int) -> socket.socket:
+    """Open the websocket of a page that has a small buffer, and reads the answer's header only."""
+    connection = socket.socket()
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 65536)
+    connection.settimeout(20)
+    connection.connect(("127.0.0.1", port))
+    lines = ("GET / HTTP/1.1", f"Host: localhost:{port}", "Connection: Upgrade")
+    key = "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ=="
+    lines += ("Upgrade: websocket", "Sec-WebSocket-Version: 13", key, "", "")
+    connection.sendall("\r\n".join(lines).encode())
+    header = b""
+    while not header.endswith(b"\r\n\r\n"):
+        header += connection.recv(1)
+    assert b" 101 " in header
+    return connection
+
+
+def read_memory(process: subprocess.Popen[bytes]) -> int:
+    """Return the resident memory of a process [bytes]."""
+    pages = int(Path(f"/proc/{process.pid}/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+CONTENT = itertools.cycle(range(256))  # the server ignores an object that it has
+
+
+def send_objects(address: str, count: int, size: int) -> None:
+    """Send commands that replace one object, by another one each time."""
+    with zmq.Context() as context, context.socket(zmq.REQ) as client:
+        client.setsockopt(zmq.RCVTIMEO, 20_000)
+        client.setsockopt(zmq.LINGER, 0)
+        client.connect(address)
+        for _ in range(count):
+            client.send_multipart([b"set_object", b"/large", bytes([next(CONTENT)]) * size])
+            assert client.recv() == b"ok"
+
+
+def count_received(connection: socket.socket, most: int) -> int:
+    """Return the number of bytes that arrive until there are enough, or the server disconnects."""
+    total = 0
+    while total < most:
+        part = connection.recv(1 << 20)
+        if not part:
+            break
+        total += len(part)
+    return total
+
+
+@pytest.fixture
+def fresh_server() -> Iterator[tuple[subprocess.Popen[bytes], str, int]]:
+    """Start a server with an empty scene; return its process, address and port for pages."""
+    process, address, web = visualization._start_server()
+    yield process, address, int(re.findall(r":(\d+)", web)[0])
+    process.kill()
+
+
+def test_pages_that_do_not_read_are_disconnected(
+    fresh_server: tuple[subprocess.Popen[bytes], str, int],
+) -> None:
+    """What waits for a page would else fill the memory; others are not affected."""
+    process, address, port = fresh_server
+    before = read_memory(process)
+    size, count = 4_000_000, 60
+    with connect_page(port) as deaf, connect_page(port) as reader:
+        for _ in range(count):
+            send_objects(address, 1, size)
+            assert count_received(reader, size) >= size
+        assert read_memory(process) - before < 150_000_000
+        assert count_received(deaf, size * count) < 80_000_000
+    with connect_page(port) as late:
+        assert count_received(late, size) >= size, "a new page gets the scene"
+
+
+def test_pages_may_be_late_and_get_large_commands(
+    fresh_server: tuple[subprocess.Popen[bytes], str, int],
+) -> None:
+    _, address, port = fresh_server
+    for size, count in ((100_000_000, 1), (3_000_000, 16)):
+        with connect_page(port) as page:
+            shown = 100_000_000 if size < 100_000_000 else 0  # the scene
+            send_objects(address, count, size)
+            time.sleep(0.2)
+            assert count_received(page, shown + size * count) >= shown + size * count
+
+
+def test_properties_do_not_pile_up(
+    fresh_server: tuple[subprocess.Popen[bytes], str, int],
+) -> None:
+    """A page that is opened later gets the last value of each property."""
+    _, address, port = fresh_server
+    with zmq.Context() as context, context.socket(zmq.REQ) as client:
+        client.setsockopt(zmq.LINGER, 0)
+        client.connect(address)
+        for k in range(300):
+            for name in ("color", "visible"):
+                command = {"type": "set_property", "path": "/a", "property": name, "value": k}
+                client.send_multipart([b"set_property", b"/a", umsgpack.packb(command)])
+                assert client.recv() == b"ok"
+    with connect_page(port) as page:
+        time.sleep(0.5)
+        data = page.recv(1 << 20)
+    assert data.count(b"set_property") == 2
+    for name in (b"color", b"visible"):
+        assert umsgpack.packb({"property": name.decode(), "value": 299})[1:] in data
+
+
 BAD_MESSAGES = [
     [b""],
     [b"\xff\xfe"],
@@ -445,3 +554,102 @@ def test_browser_shows_links_at_their_placements(page: Path, plan: Plan) -> None
         placement = np.array(measured["seen"][name.removeprefix("door.")]).reshape(4, 4).T
         np.testing.assert_allclose(placement, expected[name], atol=1e-4)
     assert 0.1 < plan.trajectory.column("door.hinge")[-2] < HINGE
+
+
+def open_at(page: Path, width: int, height: int, script: str = "") -> dict[str, Any]:
+    """Return what a script finds in a page of a size [pixels], which may be that of a telephone.
+
+    Chromium's own windows are at least 500 pixels wide, so the page is in a frame.
+    """
+    probe = f"""<script>
+    const waiting = setInterval(async () => {{
+      if (!document.documentElement.dataset.ready) return;
+      clearInterval(waiting);
+      const found = await (async () => {{ {script} }})();
+      parent.postMessage(JSON.stringify(found), "*");
+    }}, 20);
+    </script></body>"""
+    text = page.read_text(encoding="utf-8").replace("</body>", probe)
+    own = page.with_name(f"probe-{width}.html")
+    own.write_text(text, encoding="utf-8")
+    outer = page.with_name(f"outer-{width}.html")
+    outer.write_text(
+        f"""<!doctype html><body style="margin:0">
+        <iframe src="{own.name}#t=1" style="border:0;width:{width}px;height:{height}px"></iframe>
+        <script>addEventListener("message", (event) => {{
+          const shown = document.createElement("pre");
+          shown.id = "found";
+          shown.textContent = event.data;
+          document.body.append(shown);
+        }});</script>""",
+        encoding="utf-8",
+    )
+    text = browser.read_document(outer, until='<pre id="found">')
+    match = re.search(r'<pre id="found">(.*?)</pre>', text)
+    assert match, text[-2000:]
+    return dict(json.loads(html.unescape(match[1])))
+
+
+LOOK = """
+const box = (id) => document.getElementById(id).getBoundingClientRect();
+const [bar, phase, about] = ["bar", "phase", "about"].map(box);
+const panel = document.querySelector(".dg");
+const camera = vkc.viewer.camera, heights = [];
+vkc.viewer.scene.updateMatrixWorld(true);
+vkc.viewer.scene_tree.find(["meshcat", "paths"]).object.traverse((part) => {
+  const points = part.geometry && part.geometry.attributes.position;
+  for (let k = 0; points && k < points.count; k++) {
+    const point = part.position.clone().fromBufferAttribute(points, k);
+    heights.push(part.localToWorld(point).project(camera).y);
+  }
+});
+return {
+  width: innerWidth, phase: phase.width * phase.height, right: bar.right, lowest: bar.bottom,
+  text: document.getElementById("phase").textContent, about: about.right,
+  panel: panel ? getComputedStyle(panel).display : "none",
+  filled: Math.max(...heights) - Math.min(...heights),
+};
+"""
+
+
+@needs_chromium
+@pytest.mark.browser
+@pytest.mark.parametrize("size", [(390, 844), (1280, 720)])
+def test_page_fits_screens_of_telephones(page: Path, size: tuple[int, int]) -> None:
+    found = open_at(page, *size, LOOK)
+    assert found["width"] == size[0]
+    assert found["text"] == "reach door.handle"
+    assert found["phase"] > 500.0, "the name of the phase is visible"
+    assert found["right"] <= size[0]
+    assert found["lowest"] <= size[1]
+    assert found["about"] <= size[0]
+    assert found["panel"] == "none", "MeshCat's own controls are hidden"
+    if size[0] < size[1]:
+        assert found["filled"] > 0.7, "of 2: the paths extend along the height"
+
+
+PLAY = """
+// Frames of a slow machine: one every 700 ms.
+let frames = [];
+const stamps = [];
+window.requestAnimationFrame = (call) => { frames.push(call); return 0; };
+while (frames.length < 2) {  // those of the page and of MeshCat, requested before
+  await new Promise((resolve) => setTimeout(resolve, 20));
+}
+vkc.show(0);
+vkc.play(true);
+for (let k = 0; k < 5; k++) {
+  const due = frames;
+  frames = [];
+  due.forEach((call) => call(10000 + 700 * k));
+  stamps.push(vkc.time());
+}
+return { stamps };
+"""
+
+
+@needs_chromium
+@pytest.mark.browser
+def test_slow_frames_do_not_slow_the_motion(page: Path) -> None:
+    stamps = open_at(page, 800, 600, PLAY)["stamps"]
+    assert stamps == pytest.approx([0.0, 0.7, 1.4, 2.1, 2.8])

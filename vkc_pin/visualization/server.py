@@ -5,21 +5,24 @@ starts quickly.
 """
 
 import base64
-import contextlib
 import os
 import re
 import sys
 import threading
 import urllib.parse
 
+import tornado.iostream
 import tornado.web
 import tornado.websocket
+import umsgpack  # type: ignore[import-untyped]
 import zmq
+from meshcat.servers.tree import find_node, walk
 from meshcat.servers.zmqserver import ZMQWebSocketBridge
 
 LOOPBACK = "127.0.0.1"
 _PATIENCE = 5.0  # [s] until a command gets an error for an answer
 _MAX_MESSAGE = 2**28  # [bytes]
+_MAX_BACKLOG = 2**26  # [bytes] of commands that wait for a page
 _MAX_DEPTH = 50  # of the tree of shown objects, which is walked recursively
 _is_here = re.compile(r"(localhost|127\.0\.0\.1|\[::1\])(:\d+)?", re.IGNORECASE).fullmatch
 
@@ -73,6 +76,8 @@ class LoopbackBridge(ZMQWebSocketBridge):
                     raise ValueError("expected 3 frames and an open page")
                 self._is_capturing = True
             super().handle_zmq(frames)
+            if frames[0] == b"set_property":
+                self._forget_older_values(frames[1], umsgpack.unpackb(frames[2])["property"])
         except Exception as error:  # whatever a message contains, it must be answered
             self._answer(f"error: {error}".encode(errors="replace"))
 
@@ -94,11 +99,41 @@ class LoopbackBridge(ZMQWebSocketBridge):
             # Messages that arrived before the answer do not wake the stream: ZeroMQ signals edges.
             self.ioloop.add_callback(self.zmq_stream.flush, zmq.POLLIN)
 
+    def _forget_older_values(self, path: bytes, name: str) -> None:
+        """Keep the last value of a property: meshcat keeps all, and sends them to new pages."""
+        node = find_node(self.tree, [part for part in path.decode().split("/") if part])
+        last = node.properties[-1]
+        older = [data for data in node.properties if umsgpack.unpackb(data)["property"] != name]
+        node.properties = [*older, last]
+
+    def send_scene(self, page):  # type: ignore[no-untyped-def]
+        """Send all that is shown to a new page."""
+        super().send_scene(page)
+        parts = [
+            part
+            for node in walk(self.tree)
+            for part in (node.object, node.transform, node.animation, *node.properties)
+            if part is not None
+        ]
+        page.most_waiting = sum(map(len, parts)) + _MAX_BACKLOG
+
     def forward_to_websockets(self, frames):  # type: ignore[no-untyped-def]
-        """Send a command to all open pages; skip closed ones, so that the sender gets an answer."""
+        """Send a command to all open pages; skip closed ones, so that the sender gets an answer.
+
+        Pages that do not read, as in a suspended browser, are disconnected: what waits for them
+        would fill the memory. A page that has read everything gets commands of any size.
+        """
         for page in tuple(self.websocket_pool):
-            with contextlib.suppress(tornado.websocket.WebSocketClosedError):
+            if page.ws_connection is None:
+                continue
+            stream = page.ws_connection.stream
+            stream.max_write_buffer_size = page.most_waiting if stream.writing() else None
+            try:
                 page.write_message(frames[2], binary=True)
+            except tornado.websocket.WebSocketClosedError:
+                pass
+            except tornado.iostream.StreamBufferFullError:
+                stream.close()
 
 
 def _end_with_parent() -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -16,8 +17,10 @@ import pinocchio as pin
 import vkc_pin as vkc
 from vkc_pin.benchmarks import chores, gap
 from vkc_pin.importing.pictures import plot_attachments
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.visualization import drawing
 from vkc_pin.visualization import viewer as visualization
+from vkc_pin.visualization.camera import LANDSCAPE, choose_viewpoint
 from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, use_style
 from vkc_pin.visualization.plots.top_view import draw_top_view
 from vkc_pin.world.models.shapes import triangulate
@@ -63,8 +66,14 @@ from helpers.homes import write_home_urdf  # noqa: E402
 
 
 def look(target: tuple[float, ...], position: tuple[float, ...]) -> None:
-    """Take this camera instead of one that is chosen for the motion as a whole."""
-    drawing.choose_viewpoint = lambda *_: (np.array(target), np.array(position))  # type: ignore[assignment]
+    """Take this camera instead of one that is chosen for the motion, but on telephones."""
+
+    def choose(points: Floats, boxes: Any, aspect: float = LANDSCAPE) -> tuple[Floats, Floats]:
+        if aspect < 1.0:
+            return choose_viewpoint(points, boxes, aspect)
+        return np.array(target), np.array(position)
+
+    drawing.choose_viewpoint = choose
 
 
 def picture(

@@ -25,8 +25,11 @@ def draw_formula(latex: str, inline: bool) -> str:
     if found is None:
         raise RuntimeError(f"found no picture of {latex}")
     _, top, width, height = map(float, found.groups())
-    size = f"width:{width * SCALE:.3f}em;height:{height * SCALE:.3f}em"
-    style = f"{size};vertical-align:{-(top + height) * SCALE:.3f}em"
+    if inline:
+        size = f"width:{width * SCALE:.3f}em;height:{height * SCALE:.3f}em"
+        style = f"{size};vertical-align:{-(top + height) * SCALE:.3f}em"
+    else:  # site.css lets it shrink on telephones
+        style = f"--width:{width * SCALE:.3f}em"
     label = html.escape(latex.strip(), quote=True)
     about = f'class="formula" role="img" aria-label="{label}" style="{style}"'
     return picture.replace("<svg ", f"<svg {about} ", 1)

@@ -3,28 +3,38 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vkc_pin.visualization.camera import FIELD_OF_VIEW, choose_viewpoint
+from vkc_pin.visualization.camera import FIELD_OF_VIEW, LANDSCAPE, PORTRAIT, choose_viewpoint
 
 MOTION = np.array(
     [[x, y, z] for x in np.linspace(-1, 3, 9) for y in (-0.5, 0.5) for z in (0.0, 1.5)]
 )
 
 
-def test_camera_sees_the_whole_motion() -> None:
-    target, position = choose_viewpoint(MOTION, [])
-    depth_axis = target - position
-    distance = np.linalg.norm(depth_axis)
-    forward = depth_axis / distance
+def project(points: np.ndarray, aspect: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return horizontal and vertical positions in the picture: −1 and 1 at its edges."""
+    target, position = choose_viewpoint(points, [], aspect)
+    forward = target - position
+    forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
-    up = np.cross(right, forward)
-    local = MOTION - position
+    local = points - position
     depth = local @ forward
-    half = np.tan(np.radians(FIELD_OF_VIEW) / 2)
     assert (depth > 0).all()
-    assert np.abs(local @ up / depth).max() < half
-    assert np.abs(local @ right / depth).max() < 1.5 * half
-    assert np.abs(local @ right / depth).max() > 0.5 * half, "the camera is not too far away"
+    half = np.tan(np.radians(FIELD_OF_VIEW) / 2)
+    return local @ right / depth / (half * aspect), local @ np.cross(right, forward) / depth / half
+
+
+@pytest.mark.parametrize("aspect", [LANDSCAPE, PORTRAIT])
+@pytest.mark.parametrize("turn", [0.0, 0.7, 2.0, 4.0])
+def test_camera_sees_the_whole_motion(aspect: float, turn: float) -> None:
+    c, s = np.cos(turn), np.sin(turn)
+    points = MOTION @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    across, up = project(points, aspect)
+    assert np.abs(across).max() < 1.0
+    assert np.abs(up).max() < 1.0
+    # The camera is not too far away: the motion fills the longer side of the picture.
+    longer = across if aspect > 1.0 else up
+    assert np.ptp(longer) > 1.1
 
 
 def test_motion_along_x_is_seen_from_its_side() -> None:

@@ -85,9 +85,10 @@ def write_page(
     world, recorder = Replay(executed.scene, times, executed.rows), Recorder()
     beside = sample_motion(World(executed.scene), executed.planned, moments)
     viewer = meshcat.Visualizer(window=recorder)
-    Drawing(
+    drawing = Drawing(
         viewer, executed.scene, executed.trajectory, world=world, times=moments, beside=beside
-    ).draw(play=False)
+    )
+    drawing.draw(play=False)
     begin = float(times[0])
     film = {
         "duration": float(times[-1]) - begin,
@@ -98,6 +99,7 @@ def write_page(
         "because": [],
         "headline": f"{headline} (translucent: as planned)",
         "ghosts": False,
+        "portrait": drawing.find_portrait_position(),
     }
     return write_atomically(
         path, render_page(recorder, title=f"{headline} – vkc_pin", film=film).encode("utf-8")

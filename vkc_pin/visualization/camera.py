@@ -8,18 +8,21 @@ import numpy as np
 
 from vkc_pin.utils.arrays import Bools, Floats
 
-__all__ = ["FIELD_OF_VIEW", "choose_viewpoint"]
+__all__ = ["FIELD_OF_VIEW", "LANDSCAPE", "PORTRAIT", "choose_viewpoint"]
 
 FIELD_OF_VIEW = 40.0
 """Vertical opening angle of the camera [degrees]."""
-_ASPECT = 1.5  # assumed width over height of the picture
-_ELEVATION = np.radians(38.0)
+LANDSCAPE = 1.5
+"""Assumed width over height of a picture on a screen."""
+PORTRAIT = 0.5
+"""Assumed width over height of a picture on a telephone."""
+_ELEVATIONS = {LANDSCAPE: np.radians(38.0), PORTRAIT: np.radians(50.0)}
 # The first of equal azimuths is chosen: x to the right, y away.
 _AZIMUTHS = np.radians(np.arange(-90.0, 270.0, 15.0))
 
 
 def choose_viewpoint(
-    points: Floats, boxes: Sequence[tuple[Floats, Floats, float]]
+    points: Floats, boxes: Sequence[tuple[Floats, Floats, float]], aspect: float = LANDSCAPE
 ) -> tuple[Floats, Floats]:
     """Choose the target and position of a camera in the world, shape (3,) each [m].
 
@@ -27,13 +30,16 @@ def choose_viewpoint(
         points: Points of the motion, shape (n, 3) [m]. All of them will be in the picture.
         boxes: Boxes that may hide them: lower and upper corner, shape (3,) each [m], and opacity
             from 0 to 1.
+        aspect: Width over height of the picture, `LANDSCAPE` or `PORTRAIT`. The motion extends
+            along its longer side.
     """
+    elevation = _ELEVATIONS[aspect]
     lower, upper = points.min(axis=0), points.max(axis=0)
     target = (lower + upper) / 2.0
     scores = []
     flat = np.ascontiguousarray(points.T)
     for azimuth in _AZIMUTHS:
-        towards = _compute_direction(azimuth)
+        towards = _compute_direction(azimuth, elevation)
         hidden = np.zeros(len(points))
         last = float((points @ towards).min())
         for low, high, opacity in boxes:
@@ -41,12 +47,13 @@ def choose_viewpoint(
             if np.maximum(low * towards, high * towards).sum() > last:
                 np.maximum(hidden, opacity * _find_hidden(flat, towards, low, high), out=hidden)
         right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-        breadth = np.ptp(points @ right) / max(
+        away = np.array([-np.cos(azimuth), -np.sin(azimuth), 0.0])
+        extent = np.ptp(points @ (right if aspect > 1.0 else away)) / max(
             1e-9, float(np.linalg.norm(np.ptp(points[:, :2], axis=0)))
         )
-        scores.append(breadth - 3.0 * hidden.mean() - 0.10 * (1.0 - np.cos(azimuth - _AZIMUTHS[0])))
+        scores.append(extent - 3.0 * hidden.mean() - 0.10 * (1.0 - np.cos(azimuth - _AZIMUTHS[0])))
     azimuth = float(_AZIMUTHS[int(np.argmax(np.round(scores, 6)))])
-    towards = _compute_direction(azimuth)
+    towards = _compute_direction(azimuth, elevation)
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     up = np.cross(towards, right)
     offsets = points - target
@@ -54,20 +61,15 @@ def choose_viewpoint(
     tangent = np.tan(np.radians(FIELD_OF_VIEW) / 2.0) * 0.80
     depth = offsets @ towards
     needed = (
-        np.maximum(np.abs(offsets @ up) / tangent, np.abs(offsets @ right) / (tangent * _ASPECT))
+        np.maximum(np.abs(offsets @ up) / tangent, np.abs(offsets @ right) / (tangent * aspect))
         + depth
     )
     return target, target + towards * max(1.0, float(needed.max()))
 
 
-def _compute_direction(azimuth: float) -> Floats:
-    return np.array(
-        [
-            np.cos(azimuth) * np.cos(_ELEVATION),
-            np.sin(azimuth) * np.cos(_ELEVATION),
-            np.sin(_ELEVATION),
-        ]
-    )
+def _compute_direction(azimuth: float, elevation: float) -> Floats:
+    level = np.cos(elevation)
+    return np.array([np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(elevation)])
 
 
 def _find_hidden(points: Floats, direction: Floats, lower: Floats, upper: Floats) -> Bools:

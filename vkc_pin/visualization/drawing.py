@@ -21,7 +21,7 @@ from meshcat.commands import SetAnimation
 
 from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.validation.report import Report
-from vkc_pin.visualization.camera import FIELD_OF_VIEW, choose_viewpoint
+from vkc_pin.visualization.camera import FIELD_OF_VIEW, LANDSCAPE, PORTRAIT, choose_viewpoint
 from vkc_pin.visualization.room import Part, Room, load_drawn_parts
 from vkc_pin.visualization.threejs import (
     Ghost,
@@ -145,7 +145,12 @@ class Drawing:
                 self._draw_second_motion(self.beside)
         self.viewer.window.send(SetAnimation(self._make_animation(), play=play, repetitions=1))
 
-    def find_viewpoint(self) -> tuple[Floats, Floats]:
+    def find_portrait_position(self) -> list[float]:
+        """Choose the position of MeshCat's camera on an upright screen, as `_set_surroundings`."""
+        target, position = self.find_viewpoint(PORTRAIT)
+        return _convert_to_meshcat(position - target)
+
+    def find_viewpoint(self, aspect: float = LANDSCAPE) -> tuple[Floats, Floats]:
         """Choose target and position of the camera so that motion and objects are visible."""
         motion, high = self.motion, np.array([0.0, 0.0, 1.0])
         around = np.array([[x, y, 0.0] for x in (-0.6, 0.6) for y in (-0.6, 0.6)])
@@ -162,7 +167,7 @@ class Drawing:
                     points.append(local @ placement[:3, :3].T + placement[:3, 3])
                     boxes.append((points[-1].min(axis=0), points[-1].max(axis=0), 0.3))
         cloud = np.concatenate([p[:: max(1, len(p) // 60)] for p in points])
-        return choose_viewpoint(cloud, boxes)
+        return choose_viewpoint(cloud, boxes, aspect)
 
     def _find_nodes(self) -> list[str]:
         """Return the path of every joint in the tree."""
@@ -296,10 +301,9 @@ class Drawing:
         # meshcat's camera turns about the origin of its world, so the drawing moves there, not the
         # camera.
         place.set_transform(pin.SE3(np.eye(3), -target).homogeneous)
-        x, y, z = position - target
         lens = place["/Cameras/default/rotated/<object>"]
         lens.set_property("fov", FIELD_OF_VIEW)
-        lens.set_property("position", [float(x), float(z), float(-y)])
+        lens.set_property("position", _convert_to_meshcat(position - target))
         lights = ("PointLightNegativeX", "PointLightPositiveX", "FillLight")
         for name in ("/Grid", "/Axes", *(f"/Lights/{light}" for light in lights)):
             place[name].set_property("visible", False)
@@ -361,3 +365,9 @@ class Drawing:
     def _add_clip(self, movie: Animation, path: str, tracks: list[Track]) -> None:
         where = self.viewer[path].path
         movie.clips[where] = AnimationClip({track.name: track for track in tracks}, fps=1)
+
+
+def _convert_to_meshcat(vector: Floats) -> list[float]:
+    """Return a vector in the frame of MeshCat's camera, whose y axis points upwards."""
+    x, y, z = vector.tolist()
+    return [x, z, -y]

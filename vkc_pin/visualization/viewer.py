@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     import meshcat
     import pinocchio as pin
 
+    from vkc_pin.visualization.drawing import Drawing
+
 __all__ = ["Recorder", "animate", "open_viewer", "render_page", "show", "to_html"]
 
 _PATIENCE = 10.0  # [s] that the server may take for an answer
@@ -239,7 +241,7 @@ def _draw(
     *,
     play: bool = True,
     frames: Mapping[str, pin.SE3] | None = None,
-) -> None:
+) -> Drawing:
     from vkc_pin.visualization.drawing import Drawing
 
     motion = () if plan is None else (plan.trajectory, plan.report)
@@ -247,7 +249,9 @@ def _draw(
         {} if frames is None else frames, "frames", "names, each with a pinocchio.SE3"
     )
     placed = {name: as_placement(where, name=f"frames.{name}") for name, where in named.items()}
-    Drawing(viewer, scene, *motion).draw(play=play, frames=placed)
+    drawing = Drawing(viewer, scene, *motion)
+    drawing.draw(play=play, frames=placed)
+    return drawing
 
 
 def _make_page(
@@ -256,8 +260,9 @@ def _make_page(
     import meshcat
 
     recorder = Recorder()
-    _draw(meshcat.Visualizer(window=recorder), scene, plan, play=False, frames=frames)
-    return render_page(recorder, title=f"{scene.name} – vkc_pin", film=_describe_film(scene, plan))
+    drawing = _draw(meshcat.Visualizer(window=recorder), scene, plan, play=False, frames=frames)
+    film = {**_describe_film(scene, plan), "portrait": drawing.find_portrait_position()}
+    return render_page(recorder, title=f"{scene.name} – vkc_pin", film=film)
 
 
 def _describe_film(scene: Scene, plan: CheckedMotion | None) -> dict[str, Any]:

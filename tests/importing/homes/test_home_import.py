@@ -195,7 +195,6 @@ def test_invalid_homes_and_arguments_are_rejected(tmp_path: Path) -> None:
     immovable.write_text(f'<robot name="s"><link name="a">{format_box("1 1 1")}</link></robot>')
     for file, argument, message in (
         (tmp_path / "none.urdf", {}, r"none\.urdf"),
-        (immovable, {}, r"still\.urdf.*the home has nothing movable"),
         (immovable, {"packages": {"p": 1}}, "packages"),
         (immovable, {"arguments": 3}, "arguments"),
         (immovable, {"floor": float("nan")}, "floor"),
@@ -207,6 +206,76 @@ def test_invalid_homes_and_arguments_are_rejected(tmp_path: Path) -> None:
             vkc.importing.import_home(file, tmp_path / "out", **argument)
     assert not (tmp_path / "out").exists()
     assert not list(tmp_path.glob(".import-home-*"))
+
+
+WALL = ("0.1 4 2.4", "2 0 1.2")
+TABLE = ("0.8 0.8 0.8", "1 1 0.4")
+FLOOR = ("6 6 0.02", "0 0 -0.01")
+
+
+def format_fixed_urdf(kind: str) -> str:
+    """Format a wall and a table; the joint of the table moves it if it has a range."""
+    limit = '<limit lower="0.2" upper="0.2" effort="1" velocity="1"/>'
+    return (
+        f'<robot name="flat"><link name="wall">{format_box(*WALL)}</link>'
+        f'<link name="table">{format_box(TABLE[0])}</link><link name="frame"/>'
+        f'<joint name="stands" type="{kind}"><parent link="wall"/><child link="table"/>'
+        f'<origin xyz="{TABLE[1]}"/><axis xyz="0 1 0"/>{limit}</joint>'
+        '<joint name="turn" type="continuous"><parent link="table"/><child link="frame"/></joint>'
+        "</robot>"
+    )
+
+
+def format_fixed_sdf() -> str:
+    models = "".join(
+        f'<model name="{name}"><static>true</static><pose>{at} 0 0 0</pose><link name="l">'
+        f'<collision name="{name}"><geometry><box><size>{size}</size></box></geometry></collision>'
+        "</link></model>"
+        for name, (size, at) in (("wall", WALL), ("table", TABLE))
+    )
+    return f'<sdf version="1.7"><world name="flat">{models}</world></sdf>'
+
+
+def format_fixed_mjcf() -> str:
+    geoms = "".join(
+        f'<geom name="{name}" type="box" pos="{at}" '
+        f'size="{" ".join(str(float(value) / 2.0) for value in size.split())}"/>'
+        for name, (size, at) in (("wall", WALL), ("table", TABLE), ("slab", FLOOR))
+    )
+    return f"<mujoco><worldbody>{geoms}</worldbody></mujoco>"
+
+
+FIXED = {
+    "flat.sdf": format_fixed_sdf(),
+    "flat.urdf": format_fixed_urdf("fixed"),
+    "stuck.urdf": format_fixed_urdf("prismatic"),
+    "flat.xml": format_fixed_mjcf(),
+}
+
+
+@pytest.mark.parametrize(("name", "text"), FIXED.items(), ids=FIXED)
+def test_home_in_which_nothing_moves_has_obstacles_alone(
+    name: str, text: str, tmp_path: Path
+) -> None:
+    if name.endswith(".xml"):
+        pytest.importorskip("mujoco")
+    (tmp_path / name).write_text(text)
+    done = vkc.importing.import_home(tmp_path / name, tmp_path / "out")
+    assert set(done.scene.obstacle_names) == {"wall", "table"}
+    assert not done.scene.objects
+    assert (done.objects, done.reached) == ((), 0)
+    assert any("nothing moves" in note for note in done.notes)
+    assert not any("mass" in note for note in done.notes)
+    assert "of these objects" not in done.summary()
+    x_offset = 0.2 if name == "stuck.urdf" else 0.0
+    boxes = {
+        label: np.array(shape.placement.translation)
+        for label, shape in zip(done.scene.obstacle_labels, done.scene.obstacles, strict=True)
+    }
+    assert boxes["wall"] == pytest.approx([2.0, 0.0, 1.2])
+    assert boxes["table"][[0, 2]] == pytest.approx([1.0, 0.4])
+    assert boxes["table"][1] == pytest.approx(1.0 + x_offset)
+    assert vkc.plan(done.scene, [vkc.GoTo(0.0, -2.0)]).success
 
 
 def make_divided_room(drawer_x: float, **more: object) -> vkc.Scene:

@@ -82,12 +82,15 @@ class ImportedHome:
         )
         parts = ", ".join(f"{self.shapes[key]} {key}" for key in ("obstacles", "objects", "floor"))
         base = ", ".join(f"{value:.2f}" for value in self.scene.start[:3])
+        start = f"start at ({base})"
+        if self.objects:
+            start += f", with free floor to {self.reached} of these objects"
         return "\n".join(
             [
                 f"{self.scene.name}: {size}, {counts}",
                 f"  {self.shapes['file']} shapes in the file: {parts}",
                 *(f"  {note}" for note in self.notes),
-                f"start at ({base}), with free floor to {self.reached} of these objects",
+                start,
                 *(f"  {item.summary()}" for item in self.objects),
             ]
         )
@@ -129,8 +132,8 @@ def import_home(  # noqa: PLR0913 - keyword options of a public call
         arguments: Arguments of a xacro file.
 
     Raises:
-        InputError: The file cannot be read, does not describe a home, or has nothing movable; the
-            folder holds other files; an argument is invalid; or the robot finds no start pose.
+        InputError: The file cannot be read or does not describe a home; the folder holds other
+            files; an argument is invalid; or the robot finds no start pose.
         UnknownNameError: The robot is unknown, or the file refers to an undefined name.
     """
     path = check_path(file, "file", "a URDF, xacro, MJCF or SDF file")
@@ -151,16 +154,6 @@ def import_home(  # noqa: PLR0913 - keyword options of a public call
     description = move_root(description, pin.SE3(np.eye(3), np.array([0.0, 0.0, -floor])))
     low, high = compute_bounds(description, load_surfaces(description))
     home = split_home(description)
-    if not home.objects:
-        expected = (
-            "joints that are revolute, continuous, prismatic or floating, with shapes on them"
-        )
-        raise InputError(
-            "the home has nothing movable",
-            file=path,
-            expected=expected,
-            got=f"{home.shapes} fixed shapes",
-        )
     # `check_target` allowed replacing it
     with write_folder_atomically(target, force=True, source=path) as staging:
         cache: PieceCache = {}
@@ -195,10 +188,9 @@ def import_home(  # noqa: PLR0913 - keyword options of a public call
         document["start"] = {"base": scene.start[:3].tolist()}
         document["robot"] = refer_to_robot(robot, target)
         write_scene(staging / "scene.yaml", path, document, _COMMAND)
-    weight = (WEIGHTLESS,) if all(item.description.is_massless for item in home.objects) else ()
     notes = (
         *home.notes,
-        *weight,
+        *_note_movable_parts(home),
         *_note_floor_shapes(home),
         *_note_open_sides(bounds, (low, high)),
         *_note_high_objects(scene, rng),
@@ -225,6 +217,14 @@ def _choose_name(path: Path) -> str:
     """Return a name for a home."""
     name = re.sub(r"[^A-Za-z0-9_]+", "_", path.stem).strip("_")
     return choose_file_names([name], fallback="home")[0]
+
+
+def _note_movable_parts(home: Home) -> Iterator[str]:
+    if not home.objects:
+        kinds = "no joint or free body that moves a shape"
+        yield f"nothing moves ({kinds}): the scene has obstacles only"
+    elif all(item.description.is_massless for item in home.objects):
+        yield WEIGHTLESS
 
 
 def _note_floor_shapes(home: Home) -> list[str]:

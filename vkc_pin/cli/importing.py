@@ -176,9 +176,9 @@ def _import_object(arguments: argparse.Namespace) -> int:
 
 
 def _suggest_plan(done: ImportedObject) -> str:
-    """Return a line with a command that plans the first joint that a hand can open."""
+    """Return a line with a command for the first joint that a hand can open before all others."""
     for joint in done.object.coordinates.names:
-        goal = done.proposals.find_goal(joint)
+        goal = done.proposals.find_goal(joint, alone=True)
         if goal is not None and done.scene is not None:
             value = math.trunc(1e3 * goal) / 1e3  # within the limits
             setting = shlex.quote(f"{done.object.name}.{joint}={value:g}")

@@ -32,7 +32,8 @@ class Proposal:
         score: Quality, from 0 to 1.
         opens: Maps each joint to the position, [rad] or [m], to which it can be opened before the
             hand collides with the object.
-        when: Maps other joints to positions at which they must be open for the hand to fit.
+        when: Maps other joints to positions at which they must be open for the hand to fit, in the
+            order in which hands can open them.
     """
 
     attachment: Attachment
@@ -106,11 +107,17 @@ class Proposals:
         attachments = {proposal.attachment.name: proposal.attachment for proposal in self.found}
         return dataclasses.replace(self.object, attachments=freeze(attachments))
 
-    def find_goal(self, joint: str) -> float | None:
-        """Return the position, [rad] or [m], up to which a hand can open a joint; None: not."""
+    def find_goal(self, joint: str, *, alone: bool = False) -> float | None:
+        """Return the position, [rad] or [m], up to which a hand can open a joint; None: not.
+
+        Args:
+            joint: The joint.
+            alone: Whether all other joints stay closed.
+        """
         index = self.object.coordinates.index(joint)
         closed = float(np.clip(0.0, self.object.lower[index], self.object.upper[index]))
-        reached = [proposal.opens[joint] for proposal in self.opening(joint)]
+        ways = [way for way in self.opening(joint) if not (alone and way.when)]
+        reached = [way.opens[joint] for way in ways]
         return max(reached, key=lambda value: abs(value - closed), default=None)
 
     def _format_reached(self, index: int) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -105,17 +105,11 @@ def propose_attachments(
     for name, value in (("dist_safe", dist_safe), ("grasp_clearance", grasp_clearance)):
         check_number(value, name, "a distance [m]", low=0.0, high=1.0)
     search = _Search(item, robot, dist_safe, grasp_clearance, most)
-    found = [
-        proposal
-        for number in range(1, item.model.njoints)
-        for proposal in search.propose_for_joint(number)
-    ]
-    found = search.assign_names(sorted(found, key=lambda proposal: -proposal.score))
-    because = {
-        opening.joint: search.explain_failure(opening)
-        for opening in search.openings.values()
-        if not any(opening.joint in proposal.opens for proposal in found)
-    }
+    found = search.assign_names(sorted(search.propose(), key=lambda proposal: -proposal.score))
+    opened = {joint for proposal in found for joint in proposal.opens}
+    closed = [opening for opening in search.openings.values() if opening.joint not in opened]
+    names = [opening.joint for opening in closed]
+    because = {opening.joint: search.explain_failure(opening, names) for opening in closed}
     numbers = {opening.joint: number for number, opening in search.openings.items()}
     rejected = {joint: tuple(search.tallies[numbers[joint]].places) for joint in because}
     return Proposals(item, search.hand, tuple(found), because, rejected)
@@ -140,27 +134,84 @@ class _Search:
         self.narrower: dict[float, HandClearance] = {}
         self.closed = self.fitting.state.copy()
         self.tallies: dict[int, _Tally] = {}
+        self.blockers: dict[int, set[int]] = {}
         self._handles = {} if item.urdf is None else find_named_handles(read_urdf(item.urdf).root)
 
-    def propose_for_joint(self, number: int) -> list[Proposal]:
-        """Return the proposals for the links that joint `number` moves directly, best first."""
-        found = self._propose_in_state(number, {})
-        if not found:
-            links = {
-                blocked.link for blocked in self.tallies[number].blocked if blocked.what == "others"
-            }
-            above = {k for link in links for k in self.item.model.supports[self._find_joint(link)]}
-            own = {k for k in self.openings if number in self.item.model.supports[k]} | set(
-                self.item.model.supports[number]
-            )
-            others = [self.openings[k] for k in sorted(above - own - {0})]
-            if others:
-                before = self.tallies[number]
-                found = self._propose_in_state(
-                    number, {other.joint: other.opened for other in others}
-                )
-                self.tallies[number] = self.tallies[number] if found else before
-        return found or self._propose_pushes(number)
+    def propose(self) -> list[Proposal]:
+        """Return the proposals for all joints.
+
+        Joints that can be opened while all others are closed come first. Parts in the way of other
+        joints are then opened as far as a hand opens them. Where this ends, a push may go on.
+        """
+        found = {number: self._propose_in_state(number, {}) for number in self.openings}
+        closed_tallies = dict(self.tallies)
+        self.blockers = {number: self._find_blockers(number) for number in found}
+        tried = {number: dict[str, float]() for number in found}
+        stuck = [number for number, proposals in found.items() if not proposals]
+        while stuck:
+            if not self._open_after_others(found, tried):
+                number = stuck.pop(0)
+                found[number] = found[number] or self._propose_pushes(number)
+        for number, proposals in found.items():
+            if not proposals:
+                self.tallies[number] = closed_tallies[number]
+        return [proposal for proposals in found.values() for proposal in proposals]
+
+    def _open_after_others(
+        self, found: dict[int, list[Proposal]], tried: dict[int, dict[str, float]]
+    ) -> bool:
+        """Propose grasps of joints that have none, with other joints open as `found` can open them.
+
+        Args:
+            found: Proposals by joint number, which are updated.
+            tried: Conditions under which each joint was tried last, which are updated.
+
+        Returns:
+            Whether the conditions of a joint differ from those tried last.
+        """
+        is_new = False
+        for number in [number for number, proposals in found.items() if not proposals]:
+            when = self._find_conditions(number, found)
+            if when != tried[number]:
+                is_new = True
+                tried[number] = when
+                found[number] = self._propose_in_state(number, when)
+                self.blockers[number] |= self._find_blockers(number)
+        return is_new
+
+    def _find_blockers(self, number: int) -> set[int]:
+        """Return the joints that move links in the way of the hand, without the joint's own."""
+        supports = self.item.model.supports
+        links = {
+            blocked.link for blocked in self.tallies[number].blocked if blocked.what == "others"
+        }
+        above = {k for link in links for k in supports[self._find_joint(link)]}
+        own = {k for k in self.openings if number in supports[k]} | set(supports[number])
+        return above - own - {0}
+
+    def _find_conditions(
+        self, number: int, found: Mapping[int, list[Proposal]]
+    ) -> dict[str, float]:
+        """Return positions of joints that are to be opened before, in this order.
+
+        These are the joints in the way that a hand opens, and those that must be open for it.
+        """
+        own = {self.openings[k].joint for k in self.item.model.supports[number] if k}
+        conditions = dict[str, float]()
+        for blocker in sorted(self.blockers[number]):
+            opening = self.openings[blocker]
+            ways = [
+                proposal
+                for proposals in found.values()
+                for proposal in proposals
+                if opening.joint in proposal.opens
+            ]
+            if ways:
+                best = max(ways, key=lambda way: abs(way.opens[opening.joint] - opening.closed))
+                before = {**best.when, opening.joint: best.opens[opening.joint]}
+                if own.isdisjoint(before):
+                    conditions |= before
+        return conditions
 
     def _propose_pushes(self, number: int) -> list[Proposal]:
         """Return pushes for a joint whose links offer no grasp, best first; at most two."""
@@ -394,8 +445,13 @@ class _Search:
             )
         return out
 
-    def explain_failure(self, opening: Opening) -> str:
-        """Return the reason why no link that a joint moves directly offers a grasp."""
+    def explain_failure(self, opening: Opening, closed: Collection[str]) -> str:
+        """Return the reason why no link that a joint moves directly offers a grasp.
+
+        Args:
+            opening: Opening motion of the joint.
+            closed: All joints that no hand can open.
+        """
         tally, hand = self.tallies[opening.number], self.hand
         counts, rejected = tally.thickness, tally.blocked.most_common()
         if not tally.pieces:
@@ -427,7 +483,12 @@ class _Search:
             reasons.append(
                 f"{tally.cramped} let it open by less than a tenth before the hand collides"
             )
-        return f"of {min(fits, _TRIED)} places that are thin enough, " + ", ".join(reasons)
+        text = f"of {min(fits, _TRIED)} places that are thin enough, " + ", ".join(reasons)
+        blockers = [self.openings[k].joint for k in sorted(self.blockers[opening.number])]
+        shut = [joint for joint in blockers if joint in closed]
+        if shut:
+            text += f"; no hand can open {' or '.join(shut)} before, which is in the way"
+        return text
 
 
 def _retreat(joint_opening: float) -> pin.SE3:

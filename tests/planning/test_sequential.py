@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -240,17 +241,75 @@ def test_failed_attachments_are_noted() -> None:
     assert result.report.notes[-1].startswith("at drawer.roof: reach drawer.roof: out of reach")
 
 
-def test_untried_attachments_are_noted() -> None:
-    """At `side` of a lying cup, the fingers are closer to the table than the required 20 mm."""
-    scene = vkc.load_scene("household")
-    lying = pin.SE3(pin.exp3(np.array([0.0, np.pi / 2, 0.0])), np.array([-0.6, -1.6, 0.786]))
-    first = vkc.plan(scene, [vkc.Place("cup", lying)])
-    assert first.status == "infeasible"
-    untried = "at cup.oblique, cup.top: not tried, since the step names none"
-    assert first.report.notes[-1] == untried
-    assert vkc.plan(scene, [vkc.Place("cup", lying, "oblique")]).success
-    named = vkc.plan(scene, [vkc.Place("cup", lying, "side")])
-    assert untried not in named.report.notes
+ONTO_RACK = vkc.Place("cup", (-2.8, 3.2, 0.4735))
+GRASP, AWAY = vkc.Grasp("cup"), vkc.GoTo(-0.5, -0.3)
+
+
+def make_kitchen() -> Scene:
+    """Return a home with an extended rack, on which a cup held at `side` cannot be placed."""
+    return vkc.load_scene("household").with_state("dishwasher", {"door": 1.57, "rack": 0.4})
+
+
+LONG = pytest.mark.long
+
+
+@pytest.mark.parametrize(
+    ("steps", "options", "grasping"),
+    [
+        ([ONTO_RACK], {}, 0),
+        pytest.param([ONTO_RACK], {"window": 1}, 0, marks=LONG),
+        ([GRASP, ONTO_RACK], {}, 0),
+        pytest.param([GRASP, AWAY, ONTO_RACK], {}, 0, marks=LONG),
+        pytest.param([GRASP, ONTO_RACK, AWAY], {}, 0, marks=LONG),
+        pytest.param([AWAY, ONTO_RACK, AWAY], {}, 1, marks=LONG),
+        pytest.param([GRASP, ONTO_RACK, AWAY], {"window": 2}, 0, marks=LONG),
+        pytest.param([GRASP, AWAY, ONTO_RACK], {"window": 2}, 0, marks=LONG),
+    ],
+)
+def test_object_is_grasped_where_it_can_be_placed(
+    steps: list[vkc.Step], options: dict[str, Any], grasping: int
+) -> None:
+    """An attachment that an earlier step chooses suits the later one."""
+    plan = vkc.plan(make_kitchen(), steps, **options)
+    assert plan.success, plan.summary()
+    used = {phase.held["cup"] for phase in plan.trajectory.phases if phase.held}
+    assert len(used) == 1
+    assert used < {"oblique", "top"}
+    (attachment,) = used
+    named = dataclasses.replace(steps[grasping], attachment=attachment)
+    assert plan.steps == (*steps[:grasping], named, *steps[grasping + 1 :])
+
+
+@pytest.mark.parametrize(
+    "steps",
+    [
+        [dataclasses.replace(ONTO_RACK, attachment="side")],
+        pytest.param([vkc.Grasp("cup", "side"), ONTO_RACK], marks=LONG),
+    ],
+)
+@pytest.mark.parametrize("options", [{}, pytest.param({"simultaneous": False}, marks=LONG)])
+def test_named_attachment_is_never_replaced(steps: list[vkc.Step], options: dict[str, Any]) -> None:
+    plan = vkc.plan(make_kitchen(), steps, **options)
+    assert plan.status == "infeasible"
+    assert {phase.held.get("cup", "side") for phase in plan.trajectory.phases} == {"side"}
+    assert not any("oblique" in note for note in plan.report.notes)
+
+
+def test_touch_tries_other_attachments() -> None:
+    scene = add_attachment(vkc.load_scene("init_1"), "stick", "ceiling", 4.0)
+    steps = [vkc.Touch("stick.tip", TARGET)]
+    plan = vkc.plan(scene, steps)
+    assert plan.success, plan.summary()
+    assert plan.steps == (vkc.Touch("stick.tip", TARGET, "grip"),)
+
+
+def test_cheap_attempts_come_first() -> None:
+    """An attachment whose goal is blocked is left after its first guess, for one that suits."""
+    plan = vkc.plan(make_kitchen(), [ONTO_RACK])
+    assert plan.success, plan.summary()
+    refused = vkc.plan(make_kitchen(), [dataclasses.replace(ONTO_RACK, attachment="side")])
+    assert refused.status == "infeasible"
+    assert plan.statistics.evaluations < refused.statistics.evaluations
 
 
 @pytest.mark.long

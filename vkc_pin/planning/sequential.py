@@ -5,21 +5,22 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import NamedTuple
 
 from vkc_pin.errors import InputError
+from vkc_pin.planning.alternatives import try_alternatives
 from vkc_pin.planning.initialization.initial_guess import make_initial_guess
 from vkc_pin.planning.plan import Plan, PlanningStatistics
 from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.results import add_statistics, complete_draft, concatenate_plans
-from vkc_pin.planning.solve_task import TaskResult, solve_task
-from vkc_pin.utils.budget import STOP_STATUSES, current_ending, reserve_time, share_budget
+from vkc_pin.planning.solve_task import TaskResult, TaskSearch, solve_task
+from vkc_pin.utils.budget import current_ending, reserve_time, share_budget
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actions import (
     generate_alternatives,
-    has_open_attachment,
-    list_untried_attachments,
+    generate_regrasps,
+    get_grasped_object,
 )
 from vkc_pin.world.task.actuation import find_shared_coordinate
 from vkc_pin.world.task.compiler import compile_task
@@ -42,11 +43,13 @@ class PlannedStep(NamedTuple):
     Attributes:
         first, last: Numbers of the first and the last step, from 0.
         result: Result of their task.
+        left_open: Objects that they grasp at an attachment that they do not name.
     """
 
     first: int
     last: int
     result: TaskResult
+    left_open: frozenset[str] = frozenset()
 
 
 def plan_sequentially(scene: Scene, task: Task, request: PlanningRequest) -> Plan:
@@ -81,9 +84,8 @@ def _plan_from_guesses(scene: Scene, task: Task, request: PlanningRequest) -> tu
     Returns:
         The plan, and whether planning from steps would fail, too.
     """
-    plan = solve_task(scene, task, request).plan
-    has_alternatives = any(has_open_attachment(scene, step) for step in task.steps)
-    return plan, plan.status == "infeasible" and not has_alternatives
+    plan = solve_with_alternatives(scene, task, request).plan
+    return plan, plan.status == "infeasible" and len(task.open_attachments) <= 1
 
 
 def _plan_from_steps(scene: Scene, task: Task, request: PlanningRequest) -> tuple[Plan, bool]:
@@ -132,47 +134,40 @@ def _list_steps(task: Task, parts: Sequence[PlannedStep]) -> tuple[Step, ...]:
     return tuple(itertools.chain(*steps))
 
 
-def solve_with_alternatives(scene: Scene, task: Task, request: PlanningRequest) -> TaskResult:
+def solve_with_alternatives(
+    scene: Scene, task: Task, request: PlanningRequest, *, named: Collection[str] = ()
+) -> TaskResult:
     """Solve a task; if that fails, with each of the other attachments that its steps leave open.
 
     A grasped object that cannot be moved with its present grasp is released and grasped anew.
     Attachments without a known collision-free configuration at the end of a phase are skipped.
 
+    Args:
+        scene: Scene in which it starts.
+        task: The task.
+        request: Arguments of planning.
+        named: Objects that are held at attachments that the user has named.
+
     Returns:
         The first success, whose steps name the attachment unless it is the default; if all fail,
-        the first result, with notes on the others and on attachments that only a user can choose.
+        the first result, with notes on the others.
     """
-    # Terms may name phases by their numbers, which grasping anew would change.
-    alternatives = functools.cache(
-        lambda: tuple(generate_alternatives(scene, task, anew=not request.terms))
+
+    def list_alternatives() -> Iterator[tuple[str, tuple[Step, ...]]]:
+        # Terms may name phases by their numbers, which grasping anew would change.
+        if len(task.steps) == 1 and not request.terms:
+            yield from generate_regrasps(scene, task, request.options, named)
+        yield from generate_alternatives(task)
+
+    return try_alternatives(
+        TaskSearch(scene, task, request),
+        list_alternatives,
+        functools.partial(_solve_alternative, scene, request),
+        pauses=len(task.open_attachments) == 1,
     )
-    with share_budget(lambda: 1 + len(alternatives())):
-        first = last = solve_task(scene, task, request)
-    if first.is_solved or first.is_grasp_independent or current_ending():
-        return first
-    statistics, notes = [first.plan.statistics], list[str]()
-    if first.plan.report.notes:  # reasons that may be those of the grasp
-        notes += list_untried_attachments(scene, task)
-    for number, (name, steps) in enumerate(alternatives()):
-        if current_ending():
-            break
-        with share_budget(len(alternatives()) - number):
-            last = _solve_alternative(scene, steps, request)
-        statistics.append(last.plan.statistics)
-        if last.is_solved:
-            return dataclasses.replace(last, plan=add_statistics(last.plan, statistics))
-        reason = next(iter(last.plan.report.notes), last.plan.status)
-        notes += [f"at {name}: {reason}"] * (reason not in STOP_STATUSES)
-    if not notes and len(statistics) == 1:
-        return first
-    plan = first.plan
-    status = current_ending() or plan.status
-    report = dataclasses.replace(plan.report, notes=(*plan.report.notes, *notes))
-    failed = dataclasses.replace(plan, report=report, status=status)
-    return dataclasses.replace(first, plan=add_statistics(failed, statistics))
 
 
-def _solve_alternative(scene: Scene, steps: Sequence[Step], request: PlanningRequest) -> TaskResult:
+def _solve_alternative(scene: Scene, request: PlanningRequest, steps: Sequence[Step]) -> TaskResult:
     """Solve a task as one problem, or step by step if its holds cannot be in one chain.
 
     The latter is so where an object is grasped anew whose measured grasp deviates.
@@ -189,10 +184,10 @@ def _solve_alternative(scene: Scene, steps: Sequence[Step], request: PlanningReq
 def plan_each_step(scene: Scene, task: Task, request: PlanningRequest) -> list[PlannedStep]:
     """Plan every step that changes the world from the end of the one before, until one fails.
 
-    If a step of a longer draft fails, it is planned with the one before as one problem: its start
-    may have been a dead end.
+    If a step of a longer draft fails, it is planned with steps before it as one problem.
     """
     current, parts, reserved = scene, list[PlannedStep](), 0.0
+    named = set[str]()
     for number, step in enumerate(task.steps):
         # The end of a step is known only once it is planned; the first starts where the task does.
         own = task.truncate(1)
@@ -201,15 +196,21 @@ def plan_each_step(scene: Scene, task: Task, request: PlanningRequest) -> list[P
         if not own.phases:
             continue
         request.progress.set_steps(number + 1, 1, len(task.steps))
-        result = solve_with_alternatives(current, own, request)
-        part = PlannedStep(number, number, result)
-        can_join = request.is_draft and parts and len(task.steps) > 2
+        held = {hold.object for hold in current.holds}
+        is_tentative = request.is_draft and any(one.left_open & held for one in parts)
+        trial = dataclasses.replace(request, is_tentative=is_tentative)
+        result = solve_with_alternatives(current, own, trial, named=named)
+        part = PlannedStep(number, number, result, _list_open_objects(own))
+        can_join = request.is_draft and parts
         if can_join and not result.is_solved and not result.is_blocked_after(scene):
-            joint = _join_steps(task, parts[-1], part, request)
+            joint = _join_steps(task, parts, part, request)
             if joint is not None:
-                parts.pop()
+                parts = [one for one in parts if one.first < joint.first]
                 part, result = joint, joint.result
         parts.append(part)
+        grasped = get_grasped_object(step)
+        if grasped is not None and getattr(step, "attachment", None) is not None:
+            named.add(grasped)
         if not result.is_solved or current_ending():
             break
         reserved += result.check_time
@@ -219,14 +220,37 @@ def plan_each_step(scene: Scene, task: Task, request: PlanningRequest) -> list[P
 
 
 def _join_steps(
-    task: Task, before: PlannedStep, failed: PlannedStep, request: PlanningRequest
+    task: Task, parts: Sequence[PlannedStep], failed: PlannedStep, request: PlanningRequest
 ) -> PlannedStep | None:
-    """Plan a step that failed with the one before as one problem; None: their holds prevent it."""
-    scene, results = before.result.scene, [before.result, failed.result]
-    steps = task.steps[before.first : failed.last + 1]
+    """Plan a step that failed with steps before it as one problem.
+
+    These begin with the one that grasped what the hand holds, if it left the attachment open, else
+    with the one before, whose end may be a dead end.
+
+    Returns:
+        The joint step, with the statistics of the steps that it replaces. None if their holds
+        prevent it, or if these are all steps: they are planned from guesses for the whole.
+    """
+    held = {hold.object for hold in failed.result.scene.holds}
+    grasping = [part.first for part in parts if part.left_open & held]
+    shortest = parts[-1].first
+    first = grasping[-1] if grasping else shortest
+    if first == 0 and failed.last + 1 == len(task.steps):
+        first = shortest
+    steps = task.steps[first : failed.last + 1]
+    replaced = [part.result for part in parts if part.first >= first]
+    scene = replaced[0].scene
     joint = compile_task(scene, steps, request.options, nothing=True)
-    if find_shared_coordinate(scene, joint.holds) is not None or current_ending():
+    is_chain = find_shared_coordinate(scene, joint.holds) is None
+    if len(steps) == len(task.steps) or not is_chain or current_ending():
         return None
-    results.append(solve_task(scene, joint, request))
-    plan = add_statistics(results[-1].plan, [result.plan.statistics for result in results])
-    return PlannedStep(before.first, failed.last, dataclasses.replace(results[-1], plan=plan))
+    result = solve_with_alternatives(scene, joint, request)
+    results = [*replaced, failed.result, result]
+    plan = add_statistics(result.plan, [one.plan.statistics for one in results])
+    whole = dataclasses.replace(result, plan=plan)
+    return PlannedStep(first, failed.last, whole, _list_open_objects(joint))
+
+
+def _list_open_objects(task: Task) -> frozenset[str]:
+    """Return the objects whose attachments the steps of a task leave open."""
+    return frozenset(grasp.object for grasp in task.open_attachments)

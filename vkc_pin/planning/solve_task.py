@@ -117,7 +117,14 @@ def solve_task(
     guess: Guess | None = None,
     check_goals_first: bool = False,
 ) -> TaskResult:
-    """Solve a task as one nonlinear program.
+    """Solve a task as one nonlinear program; see `TaskSearch`."""
+    result = TaskSearch(scene, task, request, guess, check_goals_first=check_goals_first).run()
+    assert result is not None
+    return result
+
+
+class TaskSearch:
+    """Searches for the solution of a task as one nonlinear program.
 
     Args:
         scene: Scene in which it starts.
@@ -127,42 +134,71 @@ def solve_task(
         check_goals_first: Whether to look for collision-free goal configurations before any initial
             guess, since there are probably none.
     """
-    began, cache = time.perf_counter(), request.cache
-    built, evaluated = cache.build_time, count_evaluations()
-    request.progress.begin([phase.name for phase in task.phases])
-    search = _Search(scene, task, request)
-    try:
-        best, status = search.run(guess, check_goals_first=check_goals_first)
-    except BudgetExhaustedError as end:
-        best, status = search.find_nearest() or search.make_standing(), end.status
-    if status in STOP_STATUSES:
-        best = best.with_notes(_describe_shortfall(best.report))
-    cache.trim()  # a chore has many problems, whose solvers grow while they are used
-    build_time = cache.build_time - built
-    statistics = PlanningStatistics(
-        planning_time=time.perf_counter() - began - build_time,
-        build_time=build_time,
-        iterations=search.iterations,
-        rounds=search.rounds,
-        evaluations=count_evaluations() - evaluated,
-    ).with_times(search.times)
-    plan = Plan(
-        scene,
-        task.steps,
-        request.options,
-        best.trajectory,
-        best.report,
-        status,
-        statistics=statistics,
-        seed=request.random_seed,
-        initialization=best.name,
-        history=tuple(search.history),
-        terms=request.terms,
-        is_validated=best.is_validated,
-    )
-    found = best.problem, best.z, search.check_time
-    causes = search.is_grasp_independent, search.is_goal_blocked
-    return TaskResult(scene, task, plan, *found, *causes)
+
+    def __init__(
+        self,
+        scene: Scene,
+        task: Task,
+        request: PlanningRequest,
+        guess: Guess | None = None,
+        *,
+        check_goals_first: bool = False,
+    ) -> None:
+        self.statistics = PlanningStatistics()
+        self._scene, self._task, self._request = scene, task, request
+        self._search = _Search(scene, task, request, guess, check_goals_first=check_goals_first)
+
+    def run(self, *, pauses: bool = False) -> TaskResult | None:
+        """Search for a solution, from the last pause on.
+
+        Args:
+            pauses: Whether to pause after the first initial guess if it fails and its goal
+                configurations are not free of collisions, so that others may be cheaper.
+
+        Returns:
+            The result; None at a pause.
+        """
+        request, search = self._request, self._search
+        began, cache = time.perf_counter(), request.cache
+        built, evaluated = cache.build_time, count_evaluations()
+        request.progress.begin([phase.name for phase in self._task.phases])
+        try:
+            outcome = search.run(pauses=pauses)
+        except BudgetExhaustedError as end:
+            outcome = search.find_nearest() or search.make_standing(), end.status
+        cache.trim()  # a chore has many problems, whose solvers grow while they are used
+        build_time = cache.build_time - built
+        self.statistics += PlanningStatistics(
+            planning_time=time.perf_counter() - began - build_time,
+            build_time=build_time,
+            iterations=search.iterations,
+            rounds=search.rounds,
+            evaluations=count_evaluations() - evaluated,
+        ).with_times(search.times)
+        search.reset_statistics()
+        return None if outcome is None else self._make_result(*outcome)
+
+    def _make_result(self, best: _Candidate, status: PlanStatus) -> TaskResult:
+        request, search = self._request, self._search
+        if status in STOP_STATUSES:
+            best = best.with_notes(_describe_shortfall(best.report))
+        plan = Plan(
+            self._scene,
+            self._task.steps,
+            request.options,
+            best.trajectory,
+            best.report,
+            status,
+            statistics=self.statistics,
+            seed=request.random_seed,
+            initialization=best.name,
+            history=tuple(search.history),
+            terms=request.terms,
+            is_validated=best.is_validated,
+        )
+        found = best.problem, best.z, search.check_time
+        causes = search.is_grasp_independent, search.is_goal_blocked
+        return TaskResult(self._scene, self._task, plan, *found, *causes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,13 +242,24 @@ class _Candidate:
 class _Search:
     """State of solving one task."""
 
-    def __init__(self, scene: Scene, task: Task, request: PlanningRequest) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        task: Task,
+        request: PlanningRequest,
+        guess: Guess | None,
+        *,
+        check_goals_first: bool,
+    ) -> None:
         self.scene, self.task, self.request = scene, task, request
         self.problem: TrajectoryProblem | None = None
-        self.times = dict.fromkeys(STAGES, 0.0)
-        self.rounds = self.iterations = 0
+        self.reset_statistics()
         self.check_time, self.is_grasp_independent, self.is_goal_blocked = 0.0, False, False
         self.history: list[dict[str, float]] = []
+        self._guess, self._check_goals_first = guess, check_goals_first
+        self._guesses: Iterator[InitialGuess] = iter(())
+        self._tried: list[InitialGuess] = []
+        self._blocked_goals: list[BlockedGoal] = []
         self._blocked_phases: list[str] = []  # phases without a path of the base
         self._best: _Candidate | None = None
         # The solution nearest to feasibility of those that are too far from it to be validated.
@@ -220,43 +267,83 @@ class _Search:
         self._goals: dict[int, BlockedGoal | None] = {}
         self._proofs: list[str] | None = None
 
-    def run(self, guess: Guess | None, *, check_goals_first: bool) -> tuple[_Candidate, PlanStatus]:
-        """Return the best candidate and the status of the plan; see `solve_task`."""
-        problem, goals = self._build_problem(self.task), list[BlockedGoal]()
-        self.problem = problem
+    def reset_statistics(self) -> None:
+        """Set times and counts to zero."""
+        self.times = dict.fromkeys(STAGES, 0.0)
+        self.rounds = self.iterations = 0
+
+    def run(self, *, pauses: bool) -> tuple[_Candidate, PlanStatus] | None:
+        """Return the best candidate and the status of the plan; None at a pause.
+
+        See `TaskSearch.run`.
+        """
+        if self.problem is None:
+            self.problem = self._build_problem(self.task)
+            outcome = self._check_problem(self.problem)
+            if outcome is not None:
+                return outcome
+            guess = self._guess
+            given = None if guess is None else iter([guess(self.problem)])
+            self._guesses = self._generate_guesses(self.problem) if given is None else given
+        problem = self.problem
+        while not self._is_hopeless(problem):
+            start = next(self._guesses, None)
+            if start is None:
+                break
+            self._tried.append(start)
+            outcome = self._try_guess(problem, start)
+            if outcome is not None:
+                return outcome
+            if pauses and self._is_first_guess_blocked(problem):
+                return None
+        record_evaluations()
+        return self._explain_failure(problem, self._blocked_goals)
+
+    def _check_problem(self, problem: TrajectoryProblem) -> tuple[_Candidate, PlanStatus] | None:
+        """Return the outcome if the problem has no solution, as far as is known at once."""
         if reasons := find_impossible_conditions(problem):
             self.is_grasp_independent = True
             best = self._make_stationary(problem)
             times = best.trajectory.times.tolist()
             timed = [dataclasses.replace(one, time=times[one.waypoint]) for one in reasons]
             return dataclasses.replace(best, report=best.report.with_reasons(timed)), "infeasible"
-        if check_goals_first and (goals := self._find_blocked_goals(problem)):
+        if self._check_goals_first and (goals := self._find_blocked_goals(problem)):
+            self.is_goal_blocked = True
             best = self._make_stationary(problem)
             return best.with_notes(goal.text for goal in goals), "infeasible"
-        is_search = guess is None
-        guesses = iter([guess(problem)]) if guess else self._generate_guesses(problem)
-        for number, start in enumerate(guesses, start=1):
-            solution = self._solve_from(problem, start)
-            if self._best is not None and self._best.status == "success":
-                return self._best, "success"
-            if (
-                self._best is not None
-                and solution.status in STOP_STATUSES
-                and not solution.shortfall
-            ):
-                return self._best, solution.status
-            enforce_share()  # where the first guess suffices, it may use the whole budget
-            record_evaluations()
-            if is_search and self._find_proofs(problem):
-                break
-            if number == 1 and is_search and not _has_free_ends(problem, start):
-                goals = self._find_blocked_goals(problem)
-            elif goals:  # two guesses failed, and sampling finds no free goal configuration either
-                break
-            if any(goal.is_deep for goal in goals):
-                break
+        return None
+
+    def _try_guess(
+        self, problem: TrajectoryProblem, start: InitialGuess
+    ) -> tuple[_Candidate, PlanStatus] | None:
+        """Return the outcome if a guess leads to a solution, or if the budget ended there."""
+        solution = self._solve_from(problem, start)
+        if self._best is not None and self._best.status == "success":
+            return self._best, "success"
+        if self._best is not None and solution.status in STOP_STATUSES and not solution.shortfall:
+            return self._best, solution.status
+        enforce_share()  # where the first guess suffices, it may use the whole budget
         record_evaluations()
-        return self._explain_failure(problem, goals, is_search=is_search)
+        return None
+
+    def _is_hopeless(self, problem: TrajectoryProblem) -> bool:
+        """Return whether no further guess is worth trying, after those that failed."""
+        if not self._tried or self._guess is not None:
+            return False
+        if self._find_proofs(problem):
+            return True
+        if self._is_first_guess_blocked(problem):
+            self._blocked_goals = self._find_blocked_goals(problem)
+            is_deep = any(goal.is_deep for goal in self._blocked_goals)
+            return is_deep or (self.request.is_tentative and bool(self._blocked_goals))
+        # Two guesses failed, and sampling finds no free goal configuration either.
+        return bool(self._blocked_goals)
+
+    def _is_first_guess_blocked(self, problem: TrajectoryProblem) -> bool:
+        """Return whether one guess was tried whose goal configurations are not free."""
+        if len(self._tried) != 1 or self._guess is not None or self._find_proofs(problem):
+            return False
+        return not _has_free_ends(problem, self._tried[0])
 
     def _build_problem(self, task: Task) -> TrajectoryProblem:
         request = self.request
@@ -303,9 +390,10 @@ class _Search:
         return candidate
 
     def _explain_failure(
-        self, problem: TrajectoryProblem, goals: list[BlockedGoal], *, is_search: bool
+        self, problem: TrajectoryProblem, goals: list[BlockedGoal]
     ) -> tuple[_Candidate, PlanStatus]:
         """Return the best candidate and the status of a failure, with notes on its causes."""
+        is_search = self._guess is None
         if is_search and self._find_proofs(problem):
             best = self._make_stationary(problem)
             return best.with_notes(self._find_proofs(problem)), "infeasible"

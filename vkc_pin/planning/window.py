@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 from vkc_pin.errors import InputError
+from vkc_pin.planning.alternatives import try_alternatives
 from vkc_pin.planning.initialization.initial_guess import PhaseWaypoints, make_initial_guess
 from vkc_pin.planning.plan import Plan, PlanningStatistics
 from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.results import FINAL, concatenate_plans
 from vkc_pin.planning.solve_task import Guess, TaskResult, solve_task
-from vkc_pin.utils.budget import current_ending, reserve_time, share_budget
+from vkc_pin.utils.budget import current_ending, reserve_time
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actions import generate_alternatives, group_into_actions
 from vkc_pin.world.task.actuation import find_shared_coordinate
@@ -54,6 +56,17 @@ class _Part:
     check_time: float = 0.0
 
 
+@dataclass(frozen=True)
+class _Attempts:
+    """Search that solves a task with several random seeds; its caller counts the statistics."""
+
+    solve: Callable[[], TaskResult]
+    statistics: PlanningStatistics = field(default_factory=PlanningStatistics)
+
+    def run(self, *, pauses: bool = False) -> TaskResult:
+        return self.solve()
+
+
 class _SlidingWindow:
     """State of planning a list of steps.
 
@@ -87,7 +100,7 @@ class _SlidingWindow:
                 break
             if failed is None:
                 window = self.window
-            elif self.decided and revocations and failed.status != "infeasible":
+            elif self.decided and revocations and self._may_be_revoked(failed):
                 self.decided.pop()
                 while self.decided and not self.decided[-1].is_at_rest:
                     self.decided.pop()
@@ -96,6 +109,14 @@ class _SlidingWindow:
                 self.decided, self.ahead = self.decided + self.ahead, []
                 break
         return self._concatenate(failed)
+
+    def _may_be_revoked(self, failed: Plan) -> bool:
+        """Return whether the next action, which failed, may be feasible after other decisions.
+
+        They decide how objects are held.
+        """
+        held_anew = {*self._current_scene.holds} - {*self.scene.holds}
+        return failed.status != "infeasible" or bool(held_anew)
 
     @property
     def _current_scene(self) -> Scene:
@@ -118,16 +139,15 @@ class _SlidingWindow:
             result = self._solve(first, self._current_scene, task, guess=guess)
             if result.plan.success:
                 self.ahead = self._divide(result, first, last)
-        for attempt in range(1, 1 + self._attempts):
-            if failed is None or current_ending():
-                break
-            result = self._solve(first, self._current_scene, task, attempt)
+        if failed is not None and not current_ending():
+            # If the first action fails, its alternatives have been tried.
+            solve = self._solve_with_alternatives if self.ahead else self._solve_repeatedly
+            result = solve(first, self._current_scene, task, range(1, 1 + self._attempts))
             if result.plan.success:
+                self._name_attachments(first, result.plan.steps)
                 failed, self.ahead = None, self._divide(result, first, last)
             else:
                 failed = dataclasses.replace(failed, status=result.plan.status)
-                if result.plan.status in FINAL:
-                    break
         if failed is None:
             self.decided.append(self.ahead.pop(0))
             while not self.decided[-1].is_at_rest:
@@ -158,41 +178,50 @@ class _SlidingWindow:
         """
         number = len(self.decided) + len(self.ahead)
         scene = self.ahead[-1].after if self.ahead else self._current_scene
-        task, chosen = self._compile(scene, number, number + 1), self.actions[number]
-        alternatives = functools.cache(lambda: tuple(generate_alternatives(scene, task)))
-        with share_budget(lambda: 1 + len(alternatives())):
-            failed = self._plan_alone(number, scene, task)
-        if failed is None or current_ending():
-            return failed
-        for k, (_, steps) in enumerate(alternatives()):
-            if current_ending():
-                break
-            self.actions[number] = steps
-            task = self._compile(scene, number, number + 1)
-            other: Plan | None = failed
-            if find_shared_coordinate(scene, task.holds) is None:
-                with share_budget(len(alternatives()) - k):
-                    other = self._plan_alone(number, scene, task, check_goals_first=True)
-            if other is None:
-                return None
-            self.actions[number] = chosen
-        return failed
-
-    def _plan_alone(
-        self, number: int, scene: Scene, task: Task, *, check_goals_first: bool = False
-    ) -> Plan | None:
-        """Plan an action alone; return its plan if it fails."""
+        task = self._compile(scene, number, number + 1)
         if not task.phases:
             self.ahead.append(_Part(None, _NOTHING, scene))
             return None
-        for attempt in range(self._attempts):
-            result = self._solve(number, scene, task, attempt, check_goals_first=check_goals_first)
-            if result.plan.success:
-                self.ahead += self._divide(result, number, number + 1)
-                return None
-            if result.plan.status in FINAL:
+        result = self._solve_with_alternatives(number, scene, task, range(self._attempts))
+        if not result.plan.success:
+            return result.plan
+        self.actions[number] = result.plan.steps
+        self.ahead += self._divide(result, number, number + 1)
+        return None
+
+    def _solve_with_alternatives(
+        self, first: int, scene: Scene, task: Task, attempts: Sequence[int]
+    ) -> TaskResult:
+        """Solve a task that begins with the action `first`, if need be with other attachments."""
+
+        def solve(steps: Sequence[Step]) -> TaskResult:
+            other = compile_task(scene, steps, self._options)
+            if find_shared_coordinate(scene, other.holds) is not None:
+                raise InputError("its grasps cannot be part of one problem")
+            return self._solve_repeatedly(first, scene, other, attempts, check_goals_first=True)
+
+        return try_alternatives(
+            _Attempts(functools.partial(self._solve_repeatedly, first, scene, task, attempts)),
+            functools.partial(generate_alternatives, task),
+            solve,
+            pauses=False,
+        )
+
+    def _solve_repeatedly(
+        self,
+        first: int,
+        scene: Scene,
+        task: Task,
+        attempts: Sequence[int],
+        *,
+        check_goals_first: bool = False,
+    ) -> TaskResult:
+        """Solve a task with one random seed after the other, until that is final."""
+        for attempt in attempts:
+            result = self._solve(first, scene, task, attempt, check_goals_first=check_goals_first)
+            if result.plan.success or result.plan.status in FINAL:
                 break
-        return result.plan
+        return result
 
     def _solve(
         self,
@@ -260,6 +289,15 @@ class _SlidingWindow:
             parts.append(_Part(part, waypoints, scene, is_at_rest, check_time))
             begin = end
         return parts
+
+    def _name_attachments(self, first: int, steps: Sequence[Step]) -> None:
+        """Replace the steps of actions, from `first` on, by the same with named attachments."""
+        remaining = iter(steps)
+        last = first
+        while len(self._steps(first, last)) < len(steps):
+            count = len(self.actions[last])
+            self.actions[last] = tuple(itertools.islice(remaining, count))
+            last += 1
 
     def _steps(self, first: int, last: int) -> tuple[Step, ...]:
         return tuple(step for action in self.actions[first:last] for step in action)

@@ -131,7 +131,7 @@ def test_ball_is_fetched_with_the_stick() -> None:
     )
     assert get_names(task) == [
         "reach stick.grip",
-        "reach ball.grip by stick.tip",
+        "reach ball.pull by stick.tip",
         "go to",
         "place ball",
         "place stick",

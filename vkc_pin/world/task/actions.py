@@ -3,27 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.errors import InputError
 from vkc_pin.options import Options
 from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.scene.support import find_supports
-from vkc_pin.world.task.actuation import check_actuation, find_driving_attachments
 from vkc_pin.world.task.compiler import compile_task, make_nothing_to_do_error
 from vkc_pin.world.task.phases import Task
-from vkc_pin.world.task.steps import Actuate, Grasp, Place, Release, Step, as_steps
+from vkc_pin.world.task.steps import Actuate, Grasp, Place, Release, Step, Touch, as_steps
 
 __all__ = [
     "compile_each_step",
     "generate_alternatives",
+    "generate_regrasps",
+    "get_grasped_object",
     "group_into_actions",
-    "has_open_attachment",
-    "list_untried_attachments",
 ]
 
 
@@ -47,93 +45,64 @@ def group_into_actions(steps: Sequence[Step]) -> list[tuple[Step, ...]]:
     return actions
 
 
-def has_open_attachment(scene: Scene, step: Step) -> bool:
-    """Return whether a step moves joints of an object by one of several attachments left open.
+def generate_alternatives(task: Task) -> Iterator[tuple[str, tuple[Step, ...]]]:
+    """Yield "<object>.<attachment>" and the steps of a task with each attachment it leaves open.
 
-    That is not so if it keeps the present grasp.
+    Alternatives exist only if a single grasp of the task is open; of several such grasps, each has
+    been planned alone before.
     """
-    if not isinstance(step, Actuate) or step.attachment is not None:
-        return False
-    return len(scene.objects[step.object].object.attachments) > 1 and not _keeps_grasp(scene, step)
+    if len(task.open_attachments) == 1:
+        (grasp,) = task.open_attachments
+        before, step, after = (
+            task.steps[: grasp.step],
+            task.steps[grasp.step],
+            task.steps[grasp.step + 1 :],
+        )
+        for name in grasp.others:
+            yield f"{grasp.object}.{name}", (*before, _name_attachment(step, name), *after)
 
 
-def _keeps_grasp(scene: Scene, step: Actuate | Place) -> bool:
-    """Return whether the hand moves an object with the grasp in which it holds it at the start."""
-    hold = next((hold for hold in scene.holds if hold.object == step.object), None)
-    if hold is None or hold.by is not None or step.attachment not in (None, hold.attachment):
-        return False
-    if isinstance(step, Place):
-        return True
-    placed = scene.objects[step.object]
-    values = {f"{step.object}.{joint}": value for joint, value in step.joints.items()}
-    try:
-        check_actuation(placed, placed.object.attachments[hold.attachment], {}, values, "steps")
-    except InputError:
-        return False
-    return True
-
-
-def generate_alternatives(
-    scene: Scene, task: Task, *, anew: bool = False
+def generate_regrasps(
+    scene: Scene, task: Task, options: Options, named: Collection[str] = ()
 ) -> Iterator[tuple[str, tuple[Step, ...]]]:
-    """Yield the steps of a task with attachments that it does not use, and "<object>.<attachment>".
+    """Yield steps that release an object held at the start and grasp it again for a step.
 
-    Alternatives exist only if a single step leaves its attachment open; of several such steps, each
-    has been planned alone before. An object that is held already may have been grasped where it
-    cannot be moved from, or put down; then it is released and grasped again.
+    An object that is held already may have been grasped where it cannot be moved from, or put down.
+    It is grasped where it was, or else at another attachment that the step leaves open. A free
+    object is released only if it rests on a support.
+
+    Args:
+        scene: Scene in which the task starts.
+        task: Task of a single step. Nothing is yielded unless it moves an object held at the start.
+        options: Options of planning.
+        named: Objects that are held where the user wants them to be.
     """
-    if anew and (again := _regrasp(scene, task.steps[0])):
-        named = again[-1]
-        yield f"{named.object}.{named.attachment}, grasped again", (*again, *task.steps[1:])
-    own = [
-        (number, step)
-        for number, step in enumerate(task.steps)
-        if isinstance(step, Actuate) and has_open_attachment(scene, step)
-    ]
-    for number, step in own if len(own) == 1 else ():
-        used = {hold.attachment for hold in task.holds if hold.object == step.object}
-        values = {f"{step.object}.{joint}": value for joint, value in step.joints.items()}
-        for name in find_driving_attachments(
-            scene.objects[step.object], {}, values, f"steps[{number}]"
-        ):
-            if name not in used:
-                changed = dataclasses.replace(step, attachment=name)
-                yield (
-                    f"{step.object}.{name}",
-                    (*task.steps[:number], changed, *task.steps[number + 1 :]),
-                )
-
-
-def list_untried_attachments(scene: Scene, task: Task) -> list[str]:
-    """List attachments of objects that a step grasps at the first one for want of a name.
-
-    They are not tried in its place: some are for tools, others for another use of the object.
-    """
-    found = []
-    for step in task.steps:
-        if isinstance(step, Grasp | Place) and step.attachment is None:
-            used = {hold.attachment for hold in task.holds if hold.object == step.object}
-            others = [
-                f"{step.object}.{name}"
-                for name in scene.objects[step.object].object.attachments
-                if name not in used
-            ]
-            if others and step.object not in scene.held:
-                found.append(f"at {', '.join(others)}: not tried, since the step names none")
-    return list(dict.fromkeys(found))
-
-
-def _regrasp(scene: Scene, step: Step) -> tuple[Release, Actuate | Place] | None:
-    """Return steps that release the held object, grasp it again and move it; None if impossible.
-
-    A free object is released only if it rests on a support.
-    """
-    if not isinstance(step, Actuate | Place) or not _keeps_grasp(scene, step):
-        return None
-    placed = scene.objects[step.object]
+    (step,) = task.steps
+    name = get_grasped_object(step)
+    hold = next((one for one in task.phases[0].held if one.object == name), None)
+    if hold is None or hold.by is not None:
+        return
+    placed = scene.objects[hold.object]
     if placed.object.free and not find_supports(placed, _list_resting_shapes(scene)):
-        return None
-    return Release(step.object), dataclasses.replace(step, attachment=scene.held[step.object])
+        return
+    release, again = Release(hold.object), _name_attachment(step, hold.attachment)
+    yield f"{hold.object}.{hold.attachment}, grasped again", (release, again)
+    if hold.object not in named:
+        yield from generate_alternatives(compile_task(scene, (release, step), options))
+
+
+def get_grasped_object(step: Step) -> str | None:
+    """Return the object that a step grasps unless it is held; None for other steps."""
+    if isinstance(step, Touch):
+        owner, dot, _ = step.frame.partition(".")
+        return owner if dot else None
+    return step.object if isinstance(step, Actuate | Grasp | Place) else None
+
+
+def _name_attachment(step: Step, name: str) -> Step:
+    """Return a step that grasps, with the name of its attachment."""
+    assert isinstance(step, Actuate | Grasp | Place | Touch)
+    return dataclasses.replace(step, attachment=name)
 
 
 def _list_resting_shapes(scene: Scene) -> list[tuple[str, pin.GeometryObject]]:

@@ -17,11 +17,15 @@ from vkc_pin.world.models.articulated_object import Attachment, Latch
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.lookup import find_attachment, find_joint_limits, find_path_joints
+from vkc_pin.world.task.lookup import (
+    check_graspable,
+    find_attachment,
+    find_joint_limits,
+    find_path_joints,
+)
 
 __all__ = [
     "check_actuation",
-    "choose_attachment",
     "compute_advance",
     "find_blocking_latches",
     "find_closing_latches",
@@ -29,6 +33,7 @@ __all__ = [
     "find_driving_attachments",
     "find_push_directions",
     "find_shared_coordinate",
+    "list_driving_attachments",
 ]
 
 # Samples of a revolute freedom about a distant axis; of a slide, the ends suffice.
@@ -234,24 +239,25 @@ def find_driving_attachments(
     return found
 
 
-def choose_attachment(
+def list_driving_attachments(
     placed: PlacedObject,
     named: str | None,
     used: Iterable[str],
     state: Mapping[str, float],
     values: Mapping[str, float],
     where: str,
-) -> str:
-    """Return the attachment at which a hand brings joints to values.
+) -> list[str]:
+    """Return the attachments at which a hand may bring joints to values, the preferred one first.
 
-    It is the named one, or else the first that can.
+    It is the named one alone, or else all that can: first those that are `used` by the task.
     """
-    attachment = find_attachment(placed, named, f"{where}.attachment")
     if named is not None:
+        attachment = find_attachment(placed, named, f"{where}.attachment")
         check_actuation(placed, attachment, state, values, where)
-        return attachment.name
+        return [named]
+    check_graspable(placed, f"{where}.attachment")
     fit = find_driving_attachments(placed, state, values, where)
-    return next((name for name in used if name in fit), fit[0])
+    return list(dict.fromkeys([*(name for name in used if name in fit), *fit]))
 
 
 def find_driven_coordinates(scene: Scene, hold: Hold) -> list[str]:

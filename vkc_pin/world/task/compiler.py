@@ -15,12 +15,12 @@ from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actuation import (
-    choose_attachment,
     find_blocking_latches,
     find_closing_latches,
     find_driven_coordinates,
     find_push_directions,
     find_shared_coordinate,
+    list_driving_attachments,
 )
 from vkc_pin.world.task.lookup import (
     check_link,
@@ -30,8 +30,16 @@ from vkc_pin.world.task.lookup import (
     find_object,
     find_path_joints,
     find_robot_frame,
+    list_graspable_attachments,
 )
-from vkc_pin.world.task.phases import FrameGoal, Phase, PhaseKind, StepBoundary, Task
+from vkc_pin.world.task.phases import (
+    FrameGoal,
+    OpenAttachment,
+    Phase,
+    PhaseKind,
+    StepBoundary,
+    Task,
+)
 from vkc_pin.world.task.steps import (
     Actuate,
     GoTo,
@@ -61,6 +69,8 @@ class _Compiler:
         state: Object coordinate → value at the end of the last phase.
         resting: Free object → placement, for those not held.
         released_by: See `Phase`.
+        step: Number of the step that is compiled, from 0.
+        open: Hold → its attachment that no step names.
     """
 
     def __init__(self, scene: Scene, options: Options) -> None:
@@ -76,6 +86,8 @@ class _Compiler:
             if p.object.free and n not in scene.held
         }
         self.released_by: dict[str, tuple[Hold, int]] = {}
+        self.step = 0
+        self.open: dict[Hold, OpenAttachment] = {}
         self.supports = SupportTracker(scene, self.resting)
         for hold in self.held:
             self._add_coordinates(scene.objects[hold.object], hold.attachment)
@@ -155,16 +167,29 @@ class _Compiler:
     ) -> Hold:
         """Add the phase that grasps an object, unless it is held; return the hold."""
         placed = find_object(self.scene, name, f"{where}.object")
-        earlier = next(
-            (hold.attachment for hold in self.holds if hold.object == name and hold.frame == by),
-            None,
-        )
-        attachment = find_attachment(placed, attachment_name or earlier, f"{where}.attachment")
+        if attachment_name is not None:
+            named = find_attachment(placed, attachment_name, f"{where}.attachment")
+            return self._grasp_at([named.name], placed, where, by)
+        fit = list_graspable_attachments(placed, by, f"{where}.attachment")
+        known = (*self.held, *self.holds)
+        used = [hold.attachment for hold in known if (hold.object, hold.frame) == (name, by)]
+        return self._grasp_at(list(dict.fromkeys([*used[:1], *fit])), placed, where, by)
+
+    def _grasp_at(
+        self, attachments: Sequence[str], placed: PlacedObject, where: str, by: str | None = None
+    ) -> Hold:
+        """Grasp an object at the first of some attachments; the others are left open.
+
+        An attachment that an earlier step has chosen is kept.
+        """
+        name = placed.name
         through = self._find_holder(by, name, f"{where}.by") if by is not None else None
-        hold = Hold(name, attachment.name, *(through or (None, None)))
-        if (
-            same := next((one for one in self.held if one.nominal == hold.nominal), None)
-        ) is not None:
+        hold = Hold(name, attachments[0], *(through or (None, None)))
+        same = next((one for one in self.held if one.nominal == hold.nominal), None)
+        if same is not None:
+            if same in self.open:
+                kept = [other for other in self.open[same].others if other in attachments]
+                self.open[same] = replace(self.open[same], others=tuple(kept))
             return same
         if (held := self._find_hold(name)) is not None and placed.object.free:
             raise InputError(
@@ -196,10 +221,13 @@ class _Compiler:
         if any(one.object == name for one in self.supports.carried):
             problem = f"'{name}' rests on an object that the robot carries"
             raise InputError(problem, field=f"{where}.object", expected="Place or Release before")
+        if not any(hold in phase.grasps for phase in self.phases):
+            others = [other for other in placed.object.attachments if other in attachments[1:]]
+            self.open[hold] = OpenAttachment(self.step, name, tuple(others))
         if hold not in self.holds:
             self._drop_unused_holds(hold)
             self.holds.append(hold)
-        self._add_coordinates(placed, attachment.name)
+        self._add_coordinates(placed, hold.attachment)
         about = (hold.object, hold.attachment, hold.frame or "")
         self._append("grasp", about, self.options.reach_waypoints, grasps=(hold,))
         self.held = (*self.held, hold)
@@ -273,8 +301,8 @@ class _Compiler:
             for one in (*self.held, *reversed(self.holds))
             if one.object == step.object
         ]
-        chosen = choose_attachment(placed, step.attachment, used, self.state, values, where)
-        hold = self.grasp(step.object, chosen, where)
+        fit = list_driving_attachments(placed, step.attachment, used, self.state, values, where)
+        hold = self._grasp_at(fit, placed, where)
         ranges = {coordinate: find_joint_limits(placed, coordinate) for coordinate in values}
         path = find_path_joints(placed, placed.object.attachments[hold.attachment])
         after: dict[str, float] = {}
@@ -317,7 +345,7 @@ class _Compiler:
                 expected = "a link of a free object, or a frame of the robot"
                 raise InputError(problem, field=f"{where}.frame", expected=expected)
             check_link(placed, link, f"{where}.frame")
-            hold = self._find_hold(owner) or self.grasp(owner, None, where)
+            hold = self._find_or_grasp(owner, step.attachment, where)
         elif dot and step.frame not in self.scene.robot.frame_names:
             raise UnknownNameError("object", owner, self.scene.objects, field=f"{where}.frame")
         elif owner in self.scene.objects and owner not in self.scene.robot.frame_names:
@@ -327,6 +355,10 @@ class _Compiler:
             raise InputError(problem, field=f"{where}.frame", expected=expected, got=owner)
         else:
             link = find_robot_frame(self.scene, step.frame, f"{where}.frame")
+        if hold is None and step.attachment is not None:
+            problem = f"'{step.frame}' is no link of an object that can be grasped"
+            field, got = f"{where}.attachment", step.attachment
+            raise InputError(problem, field=field, expected="no attachment", got=got)
         self._release_fixed_objects()
         point = not isinstance(step.target, pin.SE3)
         target = pin.SE3(np.eye(3), np.array(step.target)) if point else step.target
@@ -341,11 +373,7 @@ class _Compiler:
         if not placed.object.free:
             problem = f"'{step.object}' is fixed in the world"
             raise InputError(problem, field=f"{where}.object", expected="a free object")
-        hold = self._find_hold(step.object) or self.grasp(step.object, step.attachment, where)
-        if step.attachment is not None and hold.attachment != step.attachment:
-            field, expected = f"{where}.attachment", hold.attachment
-            problem = "it is held elsewhere"
-            raise InputError(problem, field=field, expected=expected, got=step.attachment)
+        hold = self._find_or_grasp(step.object, step.attachment, where)
         upright = not isinstance(step.pose, pin.SE3)
         # As it rests now; an object held from the start, with its z axis up.
         rotation = np.eye(3) if step.object in self.scene.held else placed.placement.rotation
@@ -355,6 +383,15 @@ class _Compiler:
         about, count = (step.object,), self.options.reach_waypoints
         self._append("place", about, count, frames=(goal,), lowered={hold: pose})
         self._release(hold, pose, nearly=upright)
+
+    def _find_or_grasp(self, name: str, attachment: str | None, where: str) -> Hold:
+        """Return the present hold of a free object, which is grasped if there is none."""
+        hold = self._find_hold(name) or self.grasp(name, attachment, where)
+        if attachment not in (None, hold.attachment):
+            field, expected = f"{where}.attachment", hold.attachment
+            problem = "it is held elsewhere"
+            raise InputError(problem, field=field, expected=expected, got=attachment)
+        return hold
 
     def _check_level(self, hold: Hold, link: str, goal: pin.SE3, where: str) -> None:
         """Check that no object on a carried one would tilt with `link` at a goal."""
@@ -426,8 +463,9 @@ def compile_task(
     """Compile steps to phases, beginning at the scene's start."""
     steps = as_steps(steps)
     compiler, marks = _Compiler(scene, options), list[StepBoundary]()
-    for index, step in enumerate(steps, start=first):
-        compiler.add(step, f"steps[{index}]")
+    for index, step in enumerate(steps):
+        compiler.step = index
+        compiler.add(step, f"steps[{first + index}]")
         phases, holds = len(compiler.phases), len(compiler.holds)
         marks.append(StepBoundary(phases, holds, len(compiler.initial), compiler.held))
     if not compiler.phases and not nothing:
@@ -439,7 +477,8 @@ def compile_task(
         known = {name: value for name, value in phase.initial_values.items() if name in initial}
         found.append(replace(phase, initial_values={**initial, **known}, opening=opening))
     every = tuple(compiler.holds)
-    return Task(steps, tuple(found), every, initial, compiler.held, tuple(marks))
+    left_open = tuple(one for one in compiler.open.values() if one.others)
+    return Task(steps, tuple(found), every, initial, compiler.held, tuple(marks), left_open)
 
 
 def make_nothing_to_do_error() -> InputError:

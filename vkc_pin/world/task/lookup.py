@@ -19,6 +19,7 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Phase
 
 __all__ = [
+    "check_graspable",
     "check_link",
     "compute_openings",
     "find_attachment",
@@ -26,6 +27,7 @@ __all__ = [
     "find_object",
     "find_path_joints",
     "find_robot_frame",
+    "list_graspable_attachments",
 ]
 
 
@@ -34,18 +36,31 @@ def find_object(scene: Scene, name: str, where: str) -> PlacedObject:
     return scene.objects[check_choice(name, scene.objects, "object", where)]
 
 
-def find_attachment(placed: PlacedObject, name: str | None, where: str) -> Attachment:
-    """Return an object's attachment `name`, or its first one."""
+def find_attachment(placed: PlacedObject, name: str, where: str) -> Attachment:
+    """Return an object's attachment `name`."""
     attachments = placed.object.attachments
-    if name is None:
-        if not attachments:
-            raise InputError(
-                f"object '{placed.name}' has no attachment, so it cannot be grasped", field=where
-            )
-        return next(iter(attachments.values()))
     if name not in attachments:
         raise UnknownNameError(f"attachment of '{placed.name}'", name, attachments, field=where)
     return attachments[name]
+
+
+def check_graspable(placed: PlacedObject, where: str) -> None:
+    """Check that an object has an attachment."""
+    if not placed.object.attachments:
+        problem = f"object '{placed.name}' has no attachment, so it cannot be grasped"
+        raise InputError(problem, field=where)
+
+
+def list_graspable_attachments(placed: PlacedObject, by: str | None, where: str) -> list[str]:
+    """Return the attachments that the hand, or a tool `by`, can grasp, in the object's order.
+
+    These are the ones made for it (`Attachment.contact`), or all if the object has none such.
+    """
+    check_graspable(placed, where)
+    attachments = placed.object.attachments
+    contact = "grasp" if by is None else "touch"
+    made_for_it = [name for name, one in attachments.items() if one.contact == contact]
+    return made_for_it or list(attachments)
 
 
 def check_link(placed: PlacedObject, link: str, where: str) -> None:

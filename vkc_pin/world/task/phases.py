@@ -15,6 +15,7 @@ from vkc_pin.world.task.steps import Step
 
 __all__ = [
     "FrameGoal",
+    "OpenAttachment",
     "Phase",
     "PhaseKey",
     "PhaseKind",
@@ -138,6 +139,22 @@ class StepBoundary:
 
 
 @dataclass(frozen=True)
+class OpenAttachment:
+    """A grasp of a task whose attachment no step names.
+
+    Attributes:
+        step: Number of the step that grasps, from 0.
+        object: Name of the grasped object.
+        others: Attachments that could be grasped in place of the one in the task, in the object's
+            order; at least one.
+    """
+
+    step: int
+    object: str
+    others: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class Task:
     """The phases that bring about a list of steps.
 
@@ -149,6 +166,7 @@ class Task:
             `holds` can move.
         after: Holds at the end.
         boundaries: Extent of the task at the end of each step.
+        open_attachments: Grasps whose attachment the steps leave open.
     """
 
     steps: tuple[Step, ...]
@@ -157,6 +175,7 @@ class Task:
     state: Mapping[str, float]
     after: tuple[Hold, ...] = ()
     boundaries: tuple[StepBoundary, ...] = ()
+    open_attachments: tuple[OpenAttachment, ...] = ()
 
     @property
     def segments(self) -> int:
@@ -196,6 +215,7 @@ class Task:
             state,
             boundary.after,
             self.boundaries[:count],
+            tuple(one for one in self.open_attachments if one.step < count),
         )
 
 

@@ -68,7 +68,8 @@ class Grasp:
 
     Attributes:
         object: Its name in the scene.
-        attachment: Attachment to grasp; None: the object's first one.
+        attachment: Attachment to grasp; None leaves it open: the first one that is meant for a hand
+            (or for a tool), and if planning fails, the others.
         by: Link of a held object that grasps instead of the tool frame (a stick's tip),
             "<object>.<link>"; None: the hand.
     """
@@ -124,12 +125,16 @@ class Touch:
             or a frame of the robot.
         target: In the world frame: a point (x, y, z) [m] with any orientation, or a pose; see
             `as_placement`.
+        attachment: Attachment to grasp if the object is not held yet; None leaves it open, as in
+            `Grasp`.
     """
 
     frame: str
     target: Any
+    attachment: str | None = None
 
     def __post_init__(self) -> None:
+        _check_names(self, attachment=True)
         check_text(
             self.frame, "Touch.frame", "<object>.<link>, e.g. stick.tip, or a frame of the robot"
         )
@@ -145,7 +150,7 @@ class Place:
         pose: Goal of its base link in the world frame: a pose (see `as_placement`), or a point (x,
             y, z) [m], where it is as upright as before the plan, at any heading; if it is held at
             the start, with its z axis up.
-        attachment: Attachment to grasp if it is not held yet; None: the object's first one.
+        attachment: Attachment to grasp if it is not held yet; None leaves it open, as in `Grasp`.
     """
 
     object: str

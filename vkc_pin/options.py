@@ -18,6 +18,7 @@ _RANGES = {
     "grasp_time": (_MIN, 3600.0),
     "approach_time": (_MIN, 3600.0),
     "approach": (_MIN, 10.0),
+    "payload_factor": (_MIN, 1e3),
     "jerk_time": (0.005, 10.0),  # or 0; motions have a knot every 0.6 ms at the lower bound
 }
 _MAX_INTEGERS = {  # beyond these, planning takes hours and gigabytes
@@ -53,6 +54,8 @@ class Options:
         acceleration_weight: W_acc of eq. 1, as a multiple of W_vel [s²].
         approach: Length of the straight approach to a grasp [m].
         approach_time: Duration of the approach, at `dt` per waypoint [s].
+        payload_factor: Largest mass of carried objects, as a multiple of the payload that the
+            robot's description states.
         contact_slots: Maximum number of witness planes per waypoint.
         contact_reach: Distance of pairs below which they get a witness plane [m].
         max_outer: Rounds of the witness-plane loop.
@@ -79,6 +82,7 @@ class Options:
     acceleration_weight: float = 0.3
     approach: float = 0.08
     approach_time: float = 1.0
+    payload_factor: float = 1.0
     contact_slots: int = 4
     contact_reach: float = 0.25
     max_outer: int = 40

@@ -9,6 +9,7 @@ from pathlib import Path
 from .collisions import check_collisions
 from .exemptions import find_exemptions
 from .goals import check_goals
+from .loads import check_loads
 from .motors import check_motors
 from .neighbours import Neighbours
 from .plan import NotJudged, SavedPlan, Violation, read_plan
@@ -58,7 +59,7 @@ def find_violations(plan: SavedPlan) -> list[Violation]:
     """Return the worst violation of each rule and subject, sorted by time."""
     world = World(plan)
     stages = list(world.iterate_stages())
-    violations = [*check_motion(world), *check_goals(world, stages)]
+    violations = [*check_motion(world), *check_goals(world, stages), *check_loads(world, stages)]
     exemptions, neighbours = find_exemptions(world, stages), Neighbours(world)
     for stage in stages:
         violations += check_stage(world, stage)

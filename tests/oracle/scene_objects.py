@@ -162,6 +162,7 @@ class Robot:
     wheels: dict[str, float] | None
     turning_radius: float
     torque_limits: dict[str, float]
+    payload: float | None
 
     def compute_joint_values(self, arm: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return the values of planned and coupled joints, from those of planned joints."""
@@ -444,6 +445,7 @@ def load_robot(
             joint: float(joints.get(joint, {}).get("effort", urdf.get_effort_limit(joint)))
             for joint in arm
         },
+        payload=settings.get("payload"),
     )
 
 

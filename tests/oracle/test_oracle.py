@@ -132,6 +132,15 @@ def _block_drawer(c: Content) -> None:
     add_obstacle(c, "box", "box", in_front, size=[0.05, 0.05, 3.0])
 
 
+def _take_table_away(c: Content) -> None:
+    tables = [one for one in c["scene"]["obstacles"] if one["name"] != "dining_table"]
+    c["scene"]["obstacles"] = tables
+
+
+def _weaken_arm(c: Content) -> None:
+    c["options"]["payload_factor"] = 0.05
+
+
 CHANGES: list[tuple[str, Callable[[Content], None], str, str]] = [
     ("door", _move_start, "start", "base_x"),
     ("door", _exceed_limit, "limit", "elbow_joint"),
@@ -148,6 +157,8 @@ CHANGES: list[tuple[str, Callable[[Content], None], str, str]] = [
     ("drawer", _remove_rest, "dwell", "drawer"),
     ("cup", _move_goal, "goal", "cup.cup"),
     ("cup", _keep_grasp, "goal", "cup"),
+    ("cup", _take_table_away, "support", "cup"),
+    ("cup", _weaken_arm, "payload", "cup"),
     ("stick", _move_stick, "closure", "stick.grip"),
     ("door", _prepend_step, "order", "steps"),
     ("drawer", _block_drawer, "overlap", "drawer."),

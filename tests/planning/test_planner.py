@@ -120,7 +120,8 @@ def test_pick_and_place(simultaneous: bool) -> None:
 
 def test_touch_and_release() -> None:
     point = np.array([0.8, 1.0, 0.9])
-    steps = [vkc.Touch("stick.tip", point), vkc.Release(), vkc.GoTo(-1.0, 0.0)]
+    release = vkc.Release(unsupported=True)
+    steps = [vkc.Touch("stick.tip", point), release, vkc.GoTo(-1.0, 0.0)]
     plan = vkc.plan(make_room_behind(), steps, options=FEW)
     check_success(plan)
     assert dict(plan.trajectory.phases[-1].held) == {}

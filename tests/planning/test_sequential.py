@@ -116,6 +116,9 @@ def test_final_holds_by_a_tool() -> None:
     assert after.holds[1].at == tuple(values)
 
 
+INTO_BIN = vkc.Place("litter", BIN_POSITION, unsupported=True)
+
+
 @functools.cache
 def grasp_litter() -> vkc.Plan:
     """Return a plan that grasps a piece of litter on a shelf from the side."""
@@ -139,9 +142,9 @@ def test_object_is_regrasped_to_be_placed(offset: float) -> None:
         base = free.start[:3] + np.array([offset, 0.0, 0.0])
         free = free.with_measured_grasp("litter", base=base)
         assert free.holds[0] != hold
-    plan = vkc.plan(free, [vkc.Place("litter", BIN_POSITION)])
+    plan = vkc.plan(free, [INTO_BIN])
     assert plan.success
-    assert plan.steps == (vkc.Release("litter"), vkc.Place("litter", BIN_POSITION, "grip"))
+    assert plan.steps == (vkc.Release("litter"), dataclasses.replace(INTO_BIN, attachment="grip"))
     assert validate(free, plan.steps, plan.trajectory).ok
     first, *_, last = (phase for phase in plan.trajectory.phases if phase.holds)
     assert (first.holds, last.holds) == (free.holds, (hold,))
@@ -161,13 +164,13 @@ def test_another_grasp_replaces_one_that_prevents_placing(
     grasped = grasp_litter()
     (hold,) = grasped.end_scene().holds
     scene = compute_final_scene(make_littered_scene(), grasped.trajectory, [hold]).with_held({})
-    grasp, place = vkc.Grasp("litter", "grip"), vkc.Place("litter", BIN_POSITION)
-    plan = vkc.plan(scene, [grasp, place], simultaneous=simultaneous)
+    grasp = vkc.Grasp("litter", "grip")
+    plan = vkc.plan(scene, [grasp, INTO_BIN], simultaneous=simultaneous)
     assert plan.success, plan.summary()
     if simultaneous:  # with another grasp
-        assert plan.steps == (grasp, place)
+        assert plan.steps == (grasp, INTO_BIN)
     else:
-        again = vkc.Place("litter", BIN_POSITION, "grip")
+        again = dataclasses.replace(INTO_BIN, attachment="grip")
         assert plan.steps == (grasp, vkc.Release("litter"), again)
     np.testing.assert_allclose(
         plan.end_scene().objects["litter"].placement.translation, BIN_POSITION, atol=2e-3

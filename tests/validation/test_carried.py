@@ -223,8 +223,8 @@ def test_placing_at_a_point_leaves_only_the_heading_free(axis: int, wrong: bool)
     there = solve_reach(compute_grasp_pose(put), move_base(down, y=0.5))
     script = MotionBuilder(scene).go(up).go(down).take("stick").go(up).go(there).let_go()
     motion = script.go(move_base(up, y=0.5)).motion()
-    assert judge([vkc.Place("stick", put)], motion, scene).ok
-    report = judge([vkc.Place("stick", ASIDE.translation)], motion, scene)
+    assert judge([vkc.Place("stick", put, unsupported=True)], motion, scene).ok
+    report = judge([vkc.Place("stick", ASIDE.translation, unsupported=True)], motion, scene)
     if wrong:
         amount = pytest.approx(0.02 - 1e-3, abs=1e-7)
         check_only_violation(report, "goal", "stick.stick", "rad", amount=amount)
@@ -237,11 +237,12 @@ def test_object_grasped_at_the_start_is_placed_upright() -> None:
     start = solve_reach(compute_grasp_pose(slanted), GUESS)
     held = make_room().with_held({"stick": "grip"}).with_start(arm=start[3:])
     level = MotionBuilder(held).go(solve_reach(compute_grasp_pose(lift(STICK)), start))
-    report = judge([vkc.Place("stick", lift(STICK).translation)], level.let_go().wait())
+    goal = vkc.Place("stick", lift(STICK).translation, unsupported=True)
+    report = judge([goal], level.let_go().wait())
     assert report.ok, report.lines()
     script = MotionBuilder(held).go(move_base(held.start, x=-0.5, yaw=1.2)).let_go().wait()
     there = held.with_start(base=script.rows[-1][:3]).objects["stick"].placement
-    report = judge([vkc.Place("stick", there.translation)], script)
+    report = judge([vkc.Place("stick", there.translation, unsupported=True)], script)
     amount = pytest.approx(np.arccos(slanted.rotation[2, 2]) - 1e-3, abs=1e-6)
     check_only_violation(report, "goal", "stick.stick", "rad", amount=amount)
 
@@ -398,7 +399,7 @@ def test_free_objects_may_be_touched() -> None:
 
 @pytest.mark.parametrize(
     ("gap", "ok"),
-    [(0.01, True), (1e-3, True), (0.0, True), (-5e-5, True), (-2e-4, False), (-1e-3, False)],
+    [(2e-3, True), (1e-3, True), (0.0, True), (-5e-5, True), (-2e-4, False), (-1e-3, False)],
 )
 def test_object_may_rest_on_a_table_but_not_penetrate_it(gap: float, ok: bool) -> None:
     scene = make_room(describe_table(gap=gap))

@@ -90,7 +90,7 @@ def home(scene: Scene) -> list[Step]:
         Place("litter", CLEAR),
         Place("broom", scene.objects["broom"].placement.translation),
         Grasp("litter", "grip"),
-        Place("litter", BIN),
+        Place("litter", BIN, unsupported=True),
     ]
 
 

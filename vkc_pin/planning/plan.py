@@ -233,6 +233,7 @@ class Plan:
             "bounds": [asdict(bound) for bound in self.report.bounds],
             "remarks": list(self.report.remarks),
             "exemptions": [asdict(exemption) for exemption in self.report.exemptions],
+            "allowed": list(self.report.allowed),
         }
         return {**replace_infinite(data), "trajectory": self.trajectory.to_dict()}
 

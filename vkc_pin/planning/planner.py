@@ -26,6 +26,7 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actions import compile_each_step
 from vkc_pin.world.task.actuation import find_shared_coordinate
 from vkc_pin.world.task.compiler import compile_task
+from vkc_pin.world.task.loads import check_footings, check_loads
 from vkc_pin.world.task.phases import Task, summarize_phases
 from vkc_pin.world.task.steps import Step, as_steps
 from vkc_pin.world.task.terms import Term, check_terms_active
@@ -181,6 +182,8 @@ def plan(  # noqa: PLR0913 - keyword options of a public call
         check_terms_active(
             request.terms, [stretch for task in tasks for stretch in summarize_phases(task)]
         )
+        check_footings(scene, tasks)
+        check_loads(scene, tasks, request.options)
         if window is not None:
             found = plan_with_window(ready, steps, window, request)
         else:

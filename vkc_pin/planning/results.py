@@ -25,6 +25,7 @@ from vkc_pin.world.trajectory.splicing import concatenate_trajectories
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = [
+    "CURVELESS",
     "FINAL",
     "MAX_REPAIRS",
     "add_statistics",
@@ -37,6 +38,9 @@ __all__ = [
 
 FINAL = (*STOP_STATUSES, "infeasible")
 """Statuses after which no alternative is tried."""
+
+CURVELESS = ("torque", "support", "payload")
+"""Constraints that do not depend on the curve between waypoints."""
 
 MAX_REPAIRS = 3
 """Largest number of refinements; each brings the curve four times as close to the segments."""
@@ -157,10 +161,10 @@ def retime_validated(
     """Return a trajectory through waypoints and its report; the last one if none is valid.
 
     Around a violation the curve is made to pass through the middles of the straight segments too,
-    which the program has checked, with chains closed by `close`. Violated torque limits depend on
-    no curve and are left alone. `check` validates a trajectory, and `repairs` is the largest number
-    of refinements. If one of the user's traced `terms` depends on velocities, the program's own
-    times are kept.
+    which the program has checked, with chains closed by `close`. Violations that depend on no curve
+    are left alone. `check` validates a trajectory, and `repairs` is the largest number of
+    refinements. If one of the user's traced `terms` depends on velocities, the program's own times
+    are kept.
     """
     if any(term.formula.uses_previous for term in terms):
         return waypoints, check(waypoints)
@@ -168,7 +172,7 @@ def retime_validated(
     trajectory = retime_trajectory(scene, waypoints, jerk_time=jerk_time)
     report = check(trajectory)
     for _ in range(repairs):
-        wrong = [found.waypoint for found in report.violations if found.constraint != "torque"]
+        wrong = [one.waypoint for one in report.violations if one.constraint not in CURVELESS]
         near = {waypoint + k for waypoint in wrong for k in (-1, 0, 1)}
         if not near:
             break

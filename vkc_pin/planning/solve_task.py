@@ -29,7 +29,12 @@ from vkc_pin.planning.initialization.methods import initialize
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.plan import STAGES, Plan, PlanningStatistics
 from vkc_pin.planning.request import PlanningRequest
-from vkc_pin.planning.results import MAX_REPAIRS, make_stationary_trajectory, retime_validated
+from vkc_pin.planning.results import (
+    CURVELESS,
+    MAX_REPAIRS,
+    make_stationary_trajectory,
+    retime_validated,
+)
 from vkc_pin.planning.solver.loop import solve
 from vkc_pin.planning.solver.solution import Iteration, Solution
 from vkc_pin.planning.solver.to_trajectory import close_chains, make_trajectory
@@ -217,17 +222,24 @@ class _Candidate:
     def violation(self) -> float:
         return sum(violation.amount for violation in self.report.violations)
 
+    @property
+    def only_falls(self) -> bool:
+        """Whether it is valid, except that an object falls where no step says where to put it."""
+        kinds = {violation.constraint for violation in self.report.violations}
+        return kinds == {"support"}
+
     def is_better(self, other: _Candidate) -> bool:
         return self.report.ok or self.violation < other.violation
 
     def find_coarse_phases(self) -> set[int]:
         """Return the numbers of phases that are valid at their waypoints, but not in between.
 
-        Torques do not depend on how far waypoints are apart.
+        Torques do not depend on how far waypoints are apart, for example.
         """
         if self.status != "rejected" or self.problem is None:
             return set()
-        wrong = [each.waypoint for each in self.report.violations if each.constraint != "torque"]
+        found = self.report.violations
+        wrong = [each.waypoint for each in found if each.constraint not in CURVELESS]
         return {
             number
             for number, phase in enumerate(self.trajectory.phases[: len(self.problem.ends)])
@@ -322,6 +334,8 @@ class _Search:
             return self._best, "success"
         if self._best is not None and solution.status in STOP_STATUSES and not solution.shortfall:
             return self._best, solution.status
+        if self._best is not None and self._best.only_falls:
+            return self._best, self._best.status
         enforce_share()  # where the first guess suffices, it may use the whole budget
         record_evaluations()
         return None

@@ -17,7 +17,7 @@ from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
 
-__all__ = ["check_goals", "check_steps", "make_hold"]
+__all__ = ["check_goals", "check_steps", "find_grasped_objects", "make_hold"]
 
 MOTION_TOLERANCE = 1e-5  # smaller displacements do not count as motion [m] or [rad]
 
@@ -44,6 +44,7 @@ def check_steps(samples: Samples, steps: Sequence[Step]) -> None:
                 _check_object_step(samples, step, where)
         elif isinstance(step, Touch) and step.frame.partition(".")[0] in samples.scene.objects:
             samples.check_frame(step.frame, f"{where}.frame")
+            _check_attachment(samples, step.frame.partition(".")[0], step.attachment, where)
         elif isinstance(step, Reach | Touch) and step.frame is not None:
             frames = samples.scene.robot.frame_names
             check_choice(step.frame, frames, "frame of the robot", f"{where}.frame")
@@ -59,11 +60,15 @@ def _check_object_step(
         return
     if isinstance(step, Grasp) and step.by is not None:
         samples.check_frame(step.by, f"{where}.by")
-    if step.attachment is not None:
-        kind = f"attachment of '{name}'"
-        check_choice(step.attachment, item.attachments, kind, f"{where}.attachment")
+    _check_attachment(samples, name, step.attachment, where)
     for joint in step.joints if isinstance(step, Actuate) else ():
         check_choice(joint, item.coordinates.names, f"joint of '{name}'", f"{where}.joints")
+
+
+def _check_attachment(samples: Samples, name: str, attachment: str | None, where: str) -> None:
+    if attachment is not None:
+        known, kind = samples.scene.objects[name].object.attachments, f"attachment of '{name}'"
+        check_choice(attachment, known, kind, f"{where}.attachment")
 
 
 def check_goals(samples: Samples, steps: Sequence[Step], tolerances: Tolerances) -> list[Violation]:
@@ -76,7 +81,7 @@ def check_goals(samples: Samples, steps: Sequence[Step], tolerances: Tolerances)
     """
     phases = samples.trajectory.phases
     ends = [0, *(phase.last for phase in phases)]  # a goal may hold at the start
-    hands = _find_grasped_objects(samples, steps)
+    hands = find_grasped_objects(samples, steps)
     misses = [
         [
             _compute_goal_errors(samples, step, k, tolerances)
@@ -103,7 +108,7 @@ def check_goals(samples: Samples, steps: Sequence[Step], tolerances: Tolerances)
     return found or _check_order(samples, steps, hands, holds)
 
 
-def _find_grasped_objects(samples: Samples, steps: Sequence[Step]) -> list[set[str]]:
+def find_grasped_objects(samples: Samples, steps: Sequence[Step]) -> list[set[str]]:
     """Return the free objects that must be grasped before the first and after each step."""
     objects = samples.scene.objects
     held = {

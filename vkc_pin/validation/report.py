@@ -35,8 +35,9 @@ class Violation:
     Attributes:
         constraint: "start", "limit", "velocity", "acceleration", "jerk", "torque", "slip",
             "turning", "wheels", "dwell", "closure", "latch", "unheld", "tips", "slide", "push",
-            "opening", "goal", "order", "clearance", "penetration", "sampling" (the motion is too
-            long to be checked) or "term" (a user constraint).
+            "opening", "support" (an object falls where it is released), "payload", "goal",
+            "order", "clearance", "penetration", "sampling" (the motion is too long to be checked)
+            or "term" (a user constraint).
         subject: Violating coordinate, object, goal, term or pair of links, e.g.
             "elbow_joint", "forearm_link – sofa".
         waypoint: Index from 0; between two waypoints, the earlier one.
@@ -129,6 +130,8 @@ class Report:
         remarks: Checks that were skipped because data are missing (torque limits, masses); one
             line each.
         exemptions: Pairs that violated the clearance, or overlapped, but were exempt from it.
+        allowed: Objects that fall where they are released, or are heavier than the payload, because
+            a step or an option allows it; one line each.
     """
 
     violations: tuple[Violation, ...] = ()
@@ -143,6 +146,7 @@ class Report:
     bounds: tuple[Bound, ...] = ()
     remarks: tuple[str, ...] = ()
     exemptions: tuple[Exemption, ...] = ()
+    allowed: tuple[str, ...] = ()
 
     @property
     def ok(self) -> bool:
@@ -171,7 +175,7 @@ class Report:
         }
 
     def timing(self) -> list[str]:
-        """Return limiting constraints, torques, remarks and exemptions as lines of text."""
+        """Return limiting constraints, torques, remarks, exemptions and what else is allowed."""
         listed = ", ".join(map(str, self.bounds[:MAX_BOUNDS]))
         torque = f"torques     at most {100.0 * self.torque:.0f} % of the motors' limits"
         return [
@@ -179,6 +183,7 @@ class Report:
             *([torque] if self.torque > 0.0 else []),
             *(f"unknown     {remark}" for remark in self.remarks),
             *(f"exempt      {exemption}" for exemption in self.exemptions),
+            *(f"allowed     {line}" for line in self.allowed),
         ]
 
     def by_phase(self, trajectory: Trajectory) -> list[str]:
@@ -285,6 +290,7 @@ _LISTS: dict[str, tuple[_Check, Any, str]] = {
     "bounds": (_parse_bound, (), "a list of bounds"),
     "remarks": (check_text, (), "a list of texts"),
     "exemptions": (_parse_exemption, (), "a list of exemptions"),
+    "allowed": (check_text, (), "a list of texts"),
 }
 """Fields that are lists: check of an entry, default (None: the field is required), expectation."""
 

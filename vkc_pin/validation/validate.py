@@ -22,6 +22,7 @@ from vkc_pin.validation.contact_windows import check_gripper, check_pushes, find
 from vkc_pin.validation.distances import CollisionShapes
 from vkc_pin.validation.goals import MOTION_TOLERANCE, check_goals, check_steps
 from vkc_pin.validation.limits import MotorLoads, check_rates, check_rolling
+from vkc_pin.validation.loads import check_loads
 from vkc_pin.validation.neighbours import ExemptPairs, find_exempt_pairs
 from vkc_pin.validation.report import Exemption, Report, Violation
 from vkc_pin.validation.samples import MAX_SAMPLES, Samples
@@ -66,7 +67,8 @@ def validate(
         Report of all violated constraints: start; limits of position, velocity, acceleration, jerk
         and torque; slip, turning radius and wheel speed of the base; grasp closure; latches; rests
         for the gripper and its opening; undriven joints of objects; tilt of supporting links;
-        sliding of firm grasps; pushes that would have to pull; goals and their order; clearance at
+        sliding of firm grasps; pushes that would have to pull; released objects that fall or tip
+        over; the robot's payload; goals and their order; clearance at
         waypoints; penetration anywhere; user constraints. A motion too long to be sampled is
         reported as such.
 
@@ -93,6 +95,8 @@ def validate(
         *check_pushes(samples),
         *motors.find_violations(),
     ]
+    loads = check_loads(samples, asked, options, tolerances)
+    violations += loads.violations
     drift = _check_closure(samples, tolerances, violations)
     violations += _check_firm_grasps(samples)
     clearances = np.full(len(trajectory.phases), np.inf)
@@ -120,6 +124,7 @@ def validate(
         clearances=tuple(clearances.tolist()),
         states=len(samples.times),
         exemptions=tuple(exemptions.values()),
+        allowed=loads.allowed,
         **motors.summarize(options.jerk_time),
     )
 

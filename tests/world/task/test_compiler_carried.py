@@ -21,7 +21,7 @@ from vkc_pin.world.task.steps import Step
 OPTIONS = Options(reach_waypoints=10, turn_waypoints=3, move_waypoints=7)
 GRIP = Hold("stick", "grip")
 END = Hold("stick", "end")
-PULLED = Hold("ball", "grip", GRIP, "tip")
+PULLED = Hold("ball", "pull", GRIP, "tip")
 HANDLE = Hold("door", "handle")
 POINT = (0.4, 0.2, 0.9)
 POSE = pin.SE3(pin.rpy.rpyToMatrix(0.3, -2.0, 0.7), np.array(POINT))

@@ -200,9 +200,9 @@ def _place(scene: Scene, name: str, rng: np.random.Generator) -> Step:
         x, y, height = *rng.uniform(low[:2], high[:2]), high[2]
     else:
         x, y, height = *_spot(scene, rng), 0.0
-    return Place(
-        name, (float(x), float(y), float(height + placed.placement.translation[2] - below + _AIR))
-    )
+    z = height + placed.placement.translation[2] - below + _AIR
+    # The tops of boxes around shapes need not hold anything.
+    return Place(name, (float(x), float(y), float(z)), unsupported=True)
 
 
 def _touch(scene: Scene, name: str, rng: np.random.Generator) -> Step:

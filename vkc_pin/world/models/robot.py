@@ -64,6 +64,7 @@ class Robot:
         wheels: Wheels of the base, if the description has them. They limit the velocity of bases
             of type "differential" and "ackermann".
         turning_radius: Minimum turning radius of the base's origin, for "ackermann" bases [m].
+        payload: Largest mass of grasped objects and of those that rest on them [kg]; None: unknown.
         tight: Pairs of links, each sorted, that are less than 50 mm apart in all configurations,
             or at home → their largest distance, or that at home [m].
         file: The parsed URDF.
@@ -86,6 +87,7 @@ class Robot:
     gripper: Gripper | None = field(default=None, repr=False)
     wheels: Wheels | None = None
     turning_radius: float = 0.0
+    payload: float | None = None
     tight: Mapping[tuple[str, str], float] = field(default_factory=dict, repr=False)
     file: UrdfFile = field(repr=False)
     _opened: dict[float, Robot] = field(default_factory=dict, repr=False)

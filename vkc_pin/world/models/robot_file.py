@@ -234,6 +234,7 @@ def load_robot(  # noqa: PLR0913 - keyword options of a public call
         tool_frame=tool,
         base=base,
         touch_links=settings.touch_links,
+        payload=settings.payload,
         height=root_height,
         **read_wheels(base, turning_radius, settings, files.source),
         gripper=build_gripper(

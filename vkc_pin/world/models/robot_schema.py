@@ -101,7 +101,10 @@ class CouplingSchema(Schema):
 
 
 class RobotSchema(Schema):
-    """Contents of a robot.yaml; all fields except `urdf` are optional."""
+    """Contents of a robot.yaml; all fields except `urdf` are optional.
+
+    `payload` is the largest mass of grasped objects and of those on them [kg].
+    """
 
     urdf: str
     srdf: str | None = None
@@ -110,6 +113,7 @@ class RobotSchema(Schema):
     arm: str | None = None
     touch_links: tuple[str, ...] = ()
     base: BaseSchema = BaseSchema()
+    payload: Positive | None = None
     home: dict[str, Number] = Field(default_factory=dict)
     locked_joints: dict[str, Number] = Field(default_factory=dict)
     gripper: dict[str, FingerSchema] = Field(default_factory=dict)

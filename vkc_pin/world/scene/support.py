@@ -12,7 +12,14 @@ from vkc_pin.world.models.shapes import compute_shape_distance, compute_world_bo
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 
-__all__ = ["MAX_TILT", "SupportedObject", "compute_tilt", "find_supported_objects", "find_supports"]
+__all__ = [
+    "MAX_TILT",
+    "SupportedObject",
+    "compute_tilt",
+    "find_supported_objects",
+    "find_supporting_pairs",
+    "find_supports",
+]
 
 RESTING_DISTANCE = 5e-3
 """Displacement of the support test [m].
@@ -53,19 +60,23 @@ def find_supports(
     placed: PlacedObject, shapes: Iterable[tuple[str, pin.GeometryObject]]
 ) -> set[str]:
     """Return the labels of the shapes that an object rests on."""
+    return {label for label, _, _ in find_supporting_pairs(placed, shapes)}
+
+
+def find_supporting_pairs(
+    placed: PlacedObject, shapes: Iterable[tuple[str, pin.GeometryObject]]
+) -> list[tuple[str, pin.GeometryObject, pin.GeometryObject]]:
+    """Return label and shape of everything an object rests on, with its own shape between them."""
     own = make_world_shapes(placed)
     boxes = [compute_world_box(shape.geometry, shape.placement) for shape in own]
-    found: set[str] = set()
+    found = list[tuple[str, pin.GeometryObject, pin.GeometryObject]]()
     for label, shape in shapes:
-        if label in found:
-            continue
         lower, upper = compute_world_box(shape.geometry, shape.placement)
-        near = (
-            (low < upper + RESTING_DISTANCE).all() and (high > lower - RESTING_DISTANCE).all()
-            for low, high in boxes
-        )
-        if any(_is_supporting(shape, one) for one, close in zip(own, near, strict=True) if close):
-            found.add(label)
+        for one, (low, high) in zip(own, boxes, strict=True):
+            is_low = (low < upper + RESTING_DISTANCE).all()
+            is_near = is_low and (high > lower - RESTING_DISTANCE).all()
+            if is_near and _is_supporting(shape, one):
+                found.append((label, one, shape))
     return found
 
 

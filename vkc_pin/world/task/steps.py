@@ -10,6 +10,7 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError, UnknownNameError, format_value
 from vkc_pin.utils.arguments import (
+    check_bool,
     check_choice,
     check_coordinate,
     check_list,
@@ -151,14 +152,18 @@ class Place:
             y, z) [m], where it is as upright as before the plan, at any heading; if it is held at
             the start, with its z axis up.
         attachment: Attachment to grasp if it is not held yet; None leaves it open, as in `Grasp`.
+        unsupported: Whether it may be released where it does not rest on anything and would fall or
+            tip over; otherwise that is an error.
     """
 
     object: str
     pose: Any
     attachment: str | None = None
+    unsupported: bool = False
 
     def __post_init__(self) -> None:
         _check_names(self, object=False, attachment=True)
+        check_bool(self.unsupported, "Place.unsupported")
         object.__setattr__(self, "pose", as_target(self.pose, name="Place.pose"))
 
 
@@ -168,12 +173,15 @@ class Release:
 
     Attributes:
         object: Its name; None: all held objects.
+        unsupported: Whether it may be released where it does not rest on anything; see `Place`.
     """
 
     object: str | None = None
+    unsupported: bool = False
 
     def __post_init__(self) -> None:
         _check_names(self, object=True)
+        check_bool(self.unsupported, "Release.unsupported")
 
 
 @dataclass(frozen=True)

@@ -206,6 +206,7 @@ class ReportSchema(Schema):
     bounds: Annotated[tuple[_Bound, ...], FailFast()] = ()
     remarks: Annotated[tuple[Text, ...], FailFast()] = ()
     exemptions: Annotated[tuple[_Exemption, ...], FailFast()] = ()
+    allowed: Annotated[tuple[Text, ...], FailFast()] = ()
 
 
 class _About(Schema):

@@ -93,7 +93,8 @@ class ImportProgress:
     def __init__(self, home: Home) -> None:
         self.done = 0
         meshes = set[tuple[Path, tuple[float, ...]]]()
-        parts: list[HomeObject | Link] = [*home.objects, *_iterate_obstacle_links(home)]
+        obstacles = [link for _, link in _iterate_obstacle_links(home)]
+        parts: list[HomeObject | Link] = [*home.objects, *obstacles]
         self._sizes = [_measure_work(part, meshes) for part in parts]
         self._began = self._shown = time.perf_counter()
 

@@ -376,6 +376,10 @@ def test_invalid_options_are_rejected(
             r"points\[2\].time_from_start: times do not increase .expected more than 5\.\d+ s",
         ),
         (
+            lambda m: m["points"][2]["time_from_start"].update(sec=10**400),
+            r"points\[2\].time_from_start.sec: out of range .expected less than 4294967296, got an",
+        ),
+        (
             lambda m: m["points"][3].update(velocities={"a": 1.0}),
             r"points\[3\].velocities: wrong type of value .expected a list",
         ),

@@ -29,6 +29,7 @@ __all__ = ["from_ros", "sample_states", "to_ros"]
 
 _MAX_VALUES = 1_000_000  # positions in a message: some 300 MB
 _NANO = 1_000_000_000
+_MOST_TIME = 2**32  # [s] and [ns]: ROS has 32 bits for each
 _ROWS = ("positions", "velocities", "accelerations")  # of a point
 _LARGEST = 1e12  # [m], [rad] and their derivatives
 
@@ -350,9 +351,13 @@ def _sort_names(names: list[Any], like: Mapping[str, Any] | None, file: Path | N
 def _read_time(point: Any, file: Path | None, where: str) -> float:
     since = _get_field(point, "time_from_start", dict, file, where)
     inside = f"{where}time_from_start."
-    second = _get_field(since, "sec", int, file, inside)
-    nano = _get_field(since, "nanosec", int, file, inside)
-    return float(second + nano / _NANO)
+    found = {key: _get_field(since, key, int, file, inside) for key in ("sec", "nanosec")}
+    for key, value in found.items():
+        if not abs(value) < _MOST_TIME:
+            expected, got = f"less than {_MOST_TIME}", format_value(value)
+            field = inside + key
+            raise InputError("out of range", file=file, field=field, expected=expected, got=got)
+    return float(found["sec"] + found["nanosec"] / _NANO)
 
 
 def _read_row(

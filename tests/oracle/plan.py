@@ -135,7 +135,8 @@ class SavedPlan:
         """Return the coordinates at the waypoints and at samples between them."""
         if self.curve is None:
             return self.positions
-        return self.evaluate(np.concatenate([self.curve.sample_times(_PARTS).ravel(), self.times]))
+        times = np.concatenate([self.curve.sample_times(_PARTS).ravel(), self.times])
+        return self.evaluate(np.sort(times))
 
     def find_index(self, name: str) -> int | None:
         return self.names.index(name) if name in self.names else None

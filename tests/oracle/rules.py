@@ -31,11 +31,10 @@ def check_motion(world: World) -> Iterator[Violation]:
             )
         low, high, max_velocity, max_acceleration = _get_limits(world, name)
         outside = np.maximum(low - samples[:, k], samples[:, k] - high)
-        tolerance = (
-            1e-2 if max(low - column[0], column[0] - high) <= 1e-2 else 0.0
-        )  # a robot may start slightly outside
-        near = np.abs(samples[:, k] - column[0]) <= 1e-9
-        outside[near] -= tolerance
+        at_start = max(low - column[0], column[0] - high)
+        if 0.0 < at_start <= 1e-2 + 1e-9:  # a robot may start slightly outside, and come back
+            inside = np.flatnonzero(outside <= 0.0)
+            outside[: inside[0] if len(inside) else None] -= at_start
         yield from _find_worst(
             "limit", name, outside - 1e-5, np.zeros(len(outside)), f"limits {low:.4g} to {high:.4g}"
         )

@@ -28,6 +28,7 @@ from vkc_pin.validation.report import Exemption, Report, Violation
 from vkc_pin.validation.samples import MAX_SAMPLES, Samples
 from vkc_pin.validation.terms import check_terms
 from vkc_pin.validation.tolerances import Tolerances
+from vkc_pin.world.models.shapes import START_SLACK
 from vkc_pin.world.scene.clearance_exemptions import ACCEPTED_SHORTFALL, CONTACT_DEPTH
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.scene.support import MAX_TILT, compute_tilt
@@ -40,7 +41,6 @@ __all__ = ["check_arguments", "validate"]
 
 START_TOLERANCE = 1e-9  # difference from the scene's start [m] or [rad]
 LIMIT_TOLERANCE = 1e-5  # excess over a position limit [m] or [rad]
-START_LIMIT_TOLERANCE = 1e-2  # accepted excess at the start, where the robot already is [m], [rad]
 LATCH_TOLERANCE = 1e-4
 
 
@@ -178,15 +178,20 @@ def _check_start(samples: Samples) -> Iterator[Violation]:
 
 
 def _check_limits(samples: Samples) -> Iterator[Violation]:
-    """Check that every coordinate stays within its limits (eq. 4)."""
+    """Check that every coordinate stays within its limits (eq. 4).
+
+    A coordinate that starts outside may be as far outside as at the start until it is first inside.
+    """
     motion = samples.trajectory
     for i, name in enumerate(motion.names):
         (low, high), start = (side[:, i] for side in samples.ranges), motion.positions[0, i]
         lower, upper, _, _ = samples.get_limits(name)
         begin = max(lower - start, start - upper)
         excess = np.maximum(lower - low, high - upper)
-        if 0.0 < begin <= START_LIMIT_TOLERANCE:  # no further outside than at the start
-            excess[0] -= begin
+        if 0.0 < begin <= START_SLACK + START_TOLERANCE:
+            is_inside = (motion.positions[1:, i] >= lower) & (motion.positions[1:, i] <= upper)
+            entered = int(np.argmax(is_inside)) if is_inside.any() else len(excess)
+            excess[: entered + 1] -= begin
         worst = int(np.argmax(excess))
         if not excess[worst] <= LIMIT_TOLERANCE:
             value = float(max(low[worst], high[worst], key=lambda v: max(lower - v, v - upper)))

@@ -16,8 +16,10 @@ from vkc_pin.world.models.grafting import round_placement
 
 __all__ = [
     "LIMIT_SLACK",
+    "START_SLACK",
     "LinkDistances",
     "ShapeDistances",
+    "check_start_value",
     "clamp_to_limits",
     "compute_bounding_box",
     "compute_clearance",
@@ -32,6 +34,11 @@ __all__ = [
 
 LIMIT_SLACK = 1e-6
 """Joint values that exceed their limits by at most this are clamped [rad] or [m]."""
+START_SLACK = 1e-2
+"""Excess over the limits of a joint that is accepted of a start [rad] or [m].
+
+Encoders of joints at their stops read up to 9 mrad or 9 mm beyond.
+"""
 _CIRCLE_SEGMENTS = 28  # segments of a circle
 
 
@@ -49,6 +56,14 @@ def clamp_to_limits(
         expected = f"{lower:g} to {upper:g}"
         raise InputError(problem, field=field, expected=expected, got=f"{value:.12g}")
     return float(min(max(value, lower), upper))
+
+
+def check_start_value(value: float, lower: float, upper: float, field: str | None) -> float:
+    """Return a joint's value at a start, which may be `START_SLACK` outside its limits."""
+    if lower - START_SLACK <= value <= upper + START_SLACK:
+        within_rounding = lower - LIMIT_SLACK <= value <= upper + LIMIT_SLACK
+        return clamp_to_limits(value, lower, upper, field) if within_rounding else float(value)
+    return clamp_to_limits(value, lower, upper, field)
 
 
 def copy_shape(shape: pin.GeometryObject, name: str, placement: pin.SE3) -> pin.GeometryObject:

@@ -26,7 +26,12 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.notebook import render_card
 from vkc_pin.utils.pickling import freeze
 from vkc_pin.world.files.resources import check_path, find_file
-from vkc_pin.world.models.shapes import clamp_to_limits, compute_clearance, list_placed_shapes
+from vkc_pin.world.models.shapes import (
+    check_start_value,
+    clamp_to_limits,
+    compute_clearance,
+    list_placed_shapes,
+)
 from vkc_pin.world.scene.clearance_exemptions import warn_of_overlaps
 from vkc_pin.world.scene.hold import (
     Hold,
@@ -166,7 +171,7 @@ class Scene:
                 raise InputError(problem, field=part_name, expected=expected, got=given.shape)
             lower, upper = (limits[part] for limits in self.robot.start_limits)
             start[part] = [
-                clamp_to_limits(value, low, high, f"{part_name}.{name}")
+                check_start_value(value, low, high, f"{part_name}.{name}")
                 for value, low, high, name in zip(given, lower, upper, names[part], strict=True)
             ]
         start[:2] = [

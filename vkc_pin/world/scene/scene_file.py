@@ -23,7 +23,7 @@ from vkc_pin.world.models.grafting import round_placement
 from vkc_pin.world.models.object_file import build_object, load_object
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
-from vkc_pin.world.models.shapes import clamp_to_limits
+from vkc_pin.world.models.shapes import check_start_value
 from vkc_pin.world.scene import scene_schema as schema
 from vkc_pin.world.scene.hold import (
     Hold,
@@ -222,7 +222,7 @@ def _make_start(document: Document, item: schema.StartSchema, robot: Robot) -> F
     for index, name in enumerate(robot.coordinates.names):
         path = ("start", "base", index) if index < 3 else ("start", "arm", index - 3)
         with document.annotate_errors(path):
-            start[index] = clamp_to_limits(start[index], lower[index], upper[index], name)
+            start[index] = check_start_value(start[index], lower[index], upper[index], name)
     return start
 
 

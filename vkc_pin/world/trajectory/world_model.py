@@ -206,7 +206,9 @@ def make_scene_at(scene: Scene, world: World, row: Floats, values: Mapping[str, 
         values: Coordinates of the robot, and of joints of objects; clipped to their limits.
     """
     robot = np.array([values[name] for name in scene.robot.coordinates.names])
-    robot = np.clip(robot, *scene.robot.start_limits)
+    # A joint that stands still where it starts outside its limits stays there.
+    lower, upper = scene.robot.start_limits
+    robot = np.clip(robot, np.minimum(lower, scene.start), np.maximum(upper, scene.start))
     robot[:2] = np.clip(robot[:2], scene.arena[::2], scene.arena[1::2])
     after = scene.with_held({}).with_start(base=robot[:3], arm=robot[3:])
     for name, placed in scene.objects.items():

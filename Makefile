@@ -1,5 +1,6 @@
 # make demo: plan the door and look at it; make test: lint, types, tests, documentation; make test-long: the tests that take
-# longest; make docs: the documentation alone.
+# longest; make docs: the documentation alone; make smoke-lowest, make test-lowest: scripts for each extra, and tests, with the
+# lowest version of every dependency that has a range.
 # Each sets up .venv first, where it is not yet.
 PYTHON ?= python3
 VENV := .venv
@@ -7,7 +8,7 @@ BIN := $(VENV)/bin
 # Of pip's packages few modules are imported: with --no-compile, Python compiles those alone.
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: demo test test-long pytest lint docs clean
+.PHONY: demo test test-long test-lowest smoke-lowest smoke pytest lint docs clean
 # The extras that a goal needs are installed with the other packages, while this one is compiled.
 test test-long: EXTRAS := test docs
 lint: EXTRAS := test
@@ -31,6 +32,23 @@ pytest: $(VENV)/test.stamp
 # These leave the notebooks that they run in out/notebooks; the documentation shows them with what came out.
 test-long: $(VENV)/test.stamp $(VENV)/docs.stamp
 	$(PYTEST) -m long
+
+# `make test` installs the highest version that a range allows, these the lowest, which a user's other packages may demand. `peers`
+# is left out: it is large and serves one experiment.
+LOWEST := VENV=out/venv-lowest VERSIONS=lowest EXTRAS="test docs cluster data import notebook ros sim"
+smoke-lowest:
+	@$(MAKE) --no-print-directory $(LOWEST) smoke
+
+test-lowest: smoke-lowest
+	@$(MAKE) --no-print-directory $(LOWEST) docs pytest
+
+# Every script in a folder of its own, without the checkout on its path.
+smoke: $(VENV)/installed.stamp
+	@work=$$(mktemp -d) && trap 'rm -rf "$$work"' EXIT && for script in $(CURDIR)/tests/installed/*.py; do \
+	  echo "$$script" && mkdir "$$work/folder" && (cd "$$work/folder" && \
+	    PYTHONPATH=$(CURDIR)/tests VKC_PIN_CACHE="$$work/cache" $(abspath $(BIN))/python "$$script" > "$$work/output" 2>&1) || \
+	    { cat "$$work/output" >&2; exit 1; }; rm -rf "$$work/folder"; \
+	done
 
 docs: $(VENV)/docs.stamp
 	$(BIN)/python -m sphinx -q -W --keep-going -c docs -d out/doctrees . out/site
@@ -68,7 +86,7 @@ $(VENV)/installed.stamp: pyproject.toml CMakeLists.txt $(COMPILED) | $(VENV)/cre
 	@$(listed) build-system requires > $(VENV)/build-packages.txt
 	@$(listed) project dependencies > $(VENV)/packages.txt
 	@$(foreach extra,$(EXTRAS),$(listed) project optional-dependencies $(extra) >> $(VENV)/packages.txt &&) true
-	$(PIP) install --no-compile --requirement $(VENV)/build-packages.txt cmake ninja
+	$(PIP) install --no-compile --requirement $(VENV)/build-packages.txt --constraint $(VENV)/packages.txt cmake ninja
 	@# The other packages are installed while this one is compiled, against what is in $(VENV) already.
 	$(PIP) install --no-compile --requirement $(VENV)/packages.txt & others=$$!; \
 	$(PIP) install --no-compile --no-deps --no-build-isolation --editable . && wait $$others
@@ -80,7 +98,10 @@ $(VENV)/test.stamp $(VENV)/docs.stamp: $(VENV)/%.stamp: $(VENV)/installed.stamp
 	  $(PIP) install --no-compile --requirement $(VENV)/$*-packages.txt; }
 	@touch $@
 
-# Prints requirements of pyproject.toml: asking pip for '.[test]' would compile the package once more.
+# Prints requirements of pyproject.toml: asking pip for '.[test]' would compile the package once more. With VERSIONS=lowest, a range
+# such as ">=3.8,<5" becomes "==3.8".
 listed = $(BIN)/python -c '$(list_requirements)'
-list_requirements = import functools, sys, tomllib; \
-  print(*functools.reduce(dict.get, sys.argv[1:], tomllib.load(open("pyproject.toml", "rb"))), sep="\n")
+list_requirements = import functools, re, sys, tomllib; \
+  found = functools.reduce(dict.get, sys.argv[1:], tomllib.load(open("pyproject.toml", "rb"))); \
+  print(*[re.sub(r"$(range)", r"==\1", text) for text in found], sep="\n")
+range = $(if $(filter lowest,$(VERSIONS)),>=([\w.]+)(,<[\w.]+)?,^\b$$)

@@ -61,6 +61,39 @@ def test_build_and_runtime_dependencies_have_the_same_ranges(project: dict[str, 
     assert build["libcoal"] == run["coal"]
 
 
+def test_a_dependency_has_one_range_everywhere(project: dict[str, Any]) -> None:
+    """The lowest versions of all extras can be installed together: `make test-lowest`."""
+    extras = project["project"]["optional-dependencies"]
+    texts = [*project["project"]["dependencies"], *project["build-system"]["requires"]]
+    texts += [text for name, own in extras.items() if name != "peers" for text in own]
+    ranges: dict[str, set[str]] = {}
+    for requirement in map(Requirement, texts):
+        lowest = [one.version for one in requirement.specifier if one.operator == ">="]
+        assert len(lowest) == 1, requirement
+        ranges.setdefault(requirement.name, set()).add(str(requirement.specifier))
+    assert {name: own for name, own in ranges.items() if len(own) > 1} == {}
+
+
+def test_lowest_versions_are_exact(project: dict[str, Any]) -> None:
+    """`make test-lowest` demands the lower bound of each range, not what pip prefers."""
+    done = subprocess.run(
+        ["make", "--dry-run", "VENV=absent", "VERSIONS=lowest", "absent/installed.stamp"],
+        cwd=CHECKOUT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    (command,) = (line for line in done.stdout.splitlines() if "project dependencies" in line)
+    command = command.partition(" > ")[0].replace("absent/bin/python", sys.executable)
+    printed = subprocess.run(
+        command, shell=True, cwd=CHECKOUT, capture_output=True, text=True, check=True
+    )
+    found = {r.name: str(r.specifier) for r in map(Requirement, printed.stdout.split())}
+    for requirement in map(Requirement, project["project"]["dependencies"]):
+        (lowest,) = (one.version for one in requirement.specifier if one.operator == ">=")
+        assert found[requirement.name] == f"=={lowest}"
+
+
 def test_conda_recipe_requires_the_same_packages(project: dict[str, Any]) -> None:
     names = {"matplotlib": "matplotlib-base", "meshcat": "meshcat-python", "pin": "pinocchio"}
     names |= {"pin-pink": "pink", "PyYAML": "pyyaml"}

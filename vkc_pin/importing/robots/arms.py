@@ -403,6 +403,8 @@ def _choose_name(joints: Sequence[str], palm: Body, groups: Mapping[str, SrdfGro
 
 def sample_points(file: UrdfFile, links: Sequence[str]) -> dict[str, Floats]:
     """Return points on links, shape (n, 3) in the link's frame [m]."""
+    from trimesh.sample import sample_surface
+
     points_by_link: dict[str, Floats] = {}
     for kind in ("collision", "visual"):
         new: dict[str, list[Floats]] = {}
@@ -412,10 +414,9 @@ def sample_points(file: UrdfFile, links: Sequence[str]) -> dict[str, Floats]:
                     mesh = shape.make_mesh()
                 except InputError:
                     continue
-                corners, sampled = (
-                    np.asarray(mesh.vertices),
-                    np.asarray(mesh.sample(_POINTS, seed=0)),
-                )
+                corners = np.asarray(mesh.vertices)
+                # `Trimesh.sample` takes a seed from trimesh 5 on only.
+                sampled = np.asarray(sample_surface(mesh, _POINTS, seed=0)[0])
                 step = max(1, len(corners) // _POINTS)
                 new.setdefault(shape.link, []).append(np.vstack([corners[::step], sampled]))
         points_by_link.update({link: np.vstack(points) for link, points in new.items()})

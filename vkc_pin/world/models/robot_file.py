@@ -457,7 +457,9 @@ def _warn_of_misplaced_axle(full: pin.Model, urdf: UrdfFile, tool: str, base: Ba
     drive = find_drive(full, urdf, path)
     if drive is not None and not is_on_axle(drive):
         text = f"{urdf.path}: {describe_misplaced_axle(drive)}"
-        warnings.warn(f"{text}: its wheels will slide sideways (see docs/robots.md)", stacklevel=3)
+        warnings.warn(
+            f"{text}: its wheels will slide sideways; `vkc-pin doctor` names the axle", stacklevel=3
+        )
 
 
 def _read_rest_state(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
-from vkc_pin.utils.arguments import check_bool, check_choice
+from vkc_pin.utils.arguments import check_bool, check_choice, check_number
 from vkc_pin.utils.arrays import Floats, replace_infinite
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import check_arguments, validate
@@ -29,10 +29,15 @@ from vkc_pin.world.trajectory.formats.archives import (
     write_archive,
 )
 from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.trajectory.world_model import compute_final_scene, find_coordinate_units
+from vkc_pin.world.trajectory.world_model import (
+    compute_final_scene,
+    compute_frame_placement,
+    find_coordinate_units,
+)
 
 if TYPE_CHECKING:
     import meshcat
+    import pinocchio as pin
 
     from vkc_pin.simulation.result import SimulationResult
 
@@ -187,6 +192,23 @@ class Plan:
         from vkc_pin.simulation.execution import simulate
 
         return simulate(self.scene, self.steps, self.trajectory, **options)
+
+    def pose(self, frame: str | None, time: float) -> pin.SE3:
+        """Return where a frame is at a time of the motion, in the world frame.
+
+        Args:
+            frame: Frame of the robot (None: the tool frame), "<object>.<link>", or "<object>" for
+                the base link of an object.
+            time: From the first to the last of `trajectory.times` [s].
+
+        Raises:
+            UnknownNameError: There is no such frame.
+            InputError: The time is outside the motion.
+        """
+        first, last = (float(self.trajectory.times[k]) for k in (0, -1))
+        expected = f"a time from {first:g} to {last:g} s"
+        time = check_number(time, "time", expected, low=first, high=last)
+        return compute_frame_placement(self.scene, self.trajectory, frame, time)
 
     def contradictions(self) -> list[str]:
         """Return contradictions of a loaded file's report to validation, one per line."""

@@ -195,8 +195,21 @@ def plan(  # noqa: PLR0913 - keyword options of a public call
                 found = solve_with_alternatives(ready, task, request).plan
             else:
                 found = plan_simultaneously(ready, task, request)
+        found = _add_note_on_hand(found, tasks)
         line.end(found)
     return found
+
+
+def _add_note_on_hand(found: Plan, tasks: Sequence[Task]) -> Plan:
+    """Return a plan; if it failed and its robot cannot grasp, with a note that says so."""
+    robot = found.scene.robot
+    holds = [hold for task in tasks for hold in task.holds if hold.by is None]
+    if found.success or robot.touch_links or not holds:
+        return found
+    problem = f"no touch_links: the hand of '{robot.name}' may not touch {holds[0].object}"
+    note = f"{problem}; name palm and fingers in its robot.yaml, or run vkc-pin import-robot"
+    report = dataclasses.replace(found.report, notes=(*found.report.notes, note))
+    return dataclasses.replace(found, report=report)
 
 
 def _compile(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
+import pickle
 import shutil
 import tempfile
 from functools import cache
@@ -373,3 +374,29 @@ def test_hand_clearance_is_at_most_that_of_the_measured_grasp() -> None:
     assert found[0] == vkc.Options().grasp_clearance
     assert found[2] < 0.0 < found[1] < found[0]
     assert found[1] - found[2] == pytest.approx(0.01, abs=1e-6)
+
+
+def test_name_of_a_held_object_is_in_its_holds() -> None:
+    holds = check_hold_order([STICK, BALL])
+    assert [name in holds for name in ("stick", "ball", "fly", "grip", "")] == [
+        True,
+        True,
+        False,
+        False,
+        False,
+    ]
+    assert (STICK in holds, FLY in holds, None in holds) == (True, False, False)
+    assert holds == (STICK, BALL)
+    assert hash(holds) == hash((STICK, BALL))
+    assert pickle.loads(pickle.dumps(holds)) == holds
+    phase = vkc.PhaseSpan("carry", 0, 3, (STICK, BALL))
+    assert "ball" in phase.holds
+    assert "cup" not in phase.holds
+    assert "ball" not in vkc.PhaseSpan("go", 0, 3).holds
+    scene = vkc.load_scene("household")
+    assert "cup" not in scene.holds
+    assert "cup" in scene.with_held({"cup": "side"}).holds
+    assert (
+        "cup"
+        in vkc.Scene.from_document(scene.with_held({"cup": "side"}).document, scene.folder).holds
+    )

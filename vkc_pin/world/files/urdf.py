@@ -99,6 +99,10 @@ class UrdfFile:
     root: ElementTree.Element
     packages: Mapping[str, Path] = field(default_factory=dict)
 
+    def __repr__(self) -> str:
+        counts = f"{len(self.links)} links, {len(self.root.findall('joint'))} joints"
+        return f"<UrdfFile {self.path}: {counts}>"
+
     @property
     def links(self) -> tuple[str, ...]:
         """The names of the links, in the file's order."""

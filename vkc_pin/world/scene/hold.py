@@ -32,6 +32,7 @@ __all__ = [
     "MAX_ANGLE_DEVIATION",
     "MAX_POSITION_DEVIATION",
     "Hold",
+    "Holds",
     "Solids",
     "apply_deviation",
     "check_deviation",
@@ -236,6 +237,17 @@ class Hold:
         return f"{self.object}.{self.attachment}" + (f" by {self.frame}" if self.by else "")
 
 
+class Holds(tuple[Hold, ...]):
+    """Holds, each after the one it depends on. `in` takes a hold, or the name of an object."""
+
+    __slots__ = ()
+
+    def __contains__(self, item: object) -> bool:
+        if isinstance(item, str):
+            return any(hold.object == item for hold in self)
+        return super().__contains__(item)
+
+
 def make_holds(
     held: Mapping[str, str],
     by: Mapping[str, str] | None = None,
@@ -296,8 +308,8 @@ def make_holds(
     return tuple(found.values())
 
 
-def check_hold_order(holds: Iterable[Hold]) -> tuple[Hold, ...]:
-    """Return the holds as a tuple if each comes after the one it depends on."""
+def check_hold_order(holds: Iterable[Hold]) -> Holds:
+    """Return the holds if each comes after the one it depends on."""
     holds = check_list(holds, "holds", "a list of Hold", Hold)
     for number, hold in enumerate(holds):
         if hold.by not in (None, *holds[:number]):
@@ -306,7 +318,7 @@ def check_hold_order(holds: Iterable[Hold]) -> tuple[Hold, ...]:
                 field="holds",
                 got=str(hold),
             )
-    return holds
+    return Holds(holds)
 
 
 def get_attachment(objects: Mapping[str, PlacedObject], hold: Hold) -> Attachment:
@@ -334,7 +346,7 @@ def resolve_holds(
     objects: Mapping[str, PlacedObject],
     holds: Iterable[Hold],
     measured: Mapping[str, pin.SE3] | None = None,
-) -> tuple[Hold, ...]:
+) -> Holds:
     """Return holds checked against the objects, with values for all freedoms.
 
     Args:
@@ -383,7 +395,7 @@ def resolve_holds(
                 raise InputError(problem, field=f"held.{hold.object}.by", got=hold.frame)
         by = None if hold.by is None else found[hold.by]
         found[hold] = dataclasses.replace(hold, at=values, by=by, deviation=deviation)
-    return tuple(found.values())
+    return Holds(found.values())
 
 
 def place_held_objects(

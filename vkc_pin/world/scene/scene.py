@@ -49,7 +49,7 @@ from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 from vkc_pin.world.scene.poses import as_placement
 
 if TYPE_CHECKING:
-    from vkc_pin.world.models.robot import Robot
+    from vkc_pin.world.models.robot import Base, Robot
     from vkc_pin.world.scene.scene_schema import RegionSchema, SceneSchema
 
 __all__ = ["START_CLEARANCE", "Scene", "load_scene"]
@@ -57,6 +57,7 @@ __all__ = ["START_CLEARANCE", "Scene", "load_scene"]
 START_CLEARANCE = 0.03
 """Minimum distance of a random start from all shapes but the floor [m]."""
 _MAX_TRIES = 2000  # random starts
+_ROBOT_FILES = (".urdf", ".yaml", ".yml")
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +82,8 @@ class Scene:
         floor: Whether there is a floor at z = 0.
         arena: Part of the floor that belongs to the scene: (x_min, x_max, y_min, y_max) [m].
         start_region: Region from which `sample_start` draws, if the scene has one.
-        holds: Holds at the start, each after the one it depends on.
+        holds: Holds at the start, each after the one it depends on; `"cup" in scene.holds` is
+            whether the cup is held.
         allowed: Pairs of link labels that may be close → margin that they keep [m]; -inf: none.
         opening: Gripper opening at the start if the gripper holds nothing [m]; None: as in the
             robot's rest configuration.
@@ -149,6 +151,48 @@ class Scene:
             Document(check_mapping(document, "document")), check_path(folder, "folder")
         )
         return _check_new_scene(Scene(**fields)._with())
+
+    def with_robot(
+        self,
+        name: str | Path,
+        *,
+        base: Base = "omni",
+        tool_frame: str | None = None,
+        turning_radius: float | None = None,
+        height: float | None = None,
+    ) -> Scene:
+        """Return the scene with another robot, which starts at the same place and holds nothing.
+
+        Its arm is at home, and its gripper as in the rest configuration. For other arguments of
+        `load_robot`, give the path of a robot.yaml.
+
+        Args:
+            name: Name of the robot, or path of its folder, robot.yaml or URDF; see `load_robot`.
+            base: Type of the base.
+            tool_frame: Frame of the hand; None: that of robot.yaml.
+            turning_radius: Minimum turning radius of an "ackermann" base [m].
+            height: Height of the root link above the floor [m]; None: that of robot.yaml.
+
+        Raises:
+            InputError: The robot is invalid, or its start is outside its limits.
+            UnknownNameError: There is no such robot, or an entry of `allow` names a link that it
+                does not have.
+        """
+        check_instance(name, (str, Path), "name")
+        is_path = isinstance(name, Path) or "/" in name or Path(name).suffix in _ROBOT_FILES
+        robot = {
+            "name": str(Path(name).absolute()) if is_path else name,
+            "base": base,
+            "tool_frame": tool_frame,
+            "turning_radius": turning_radius,
+        }
+        start = {"base": self.start[:3].tolist(), "z": height}
+        document = {
+            **self.document,
+            "robot": {key: value for key, value in robot.items() if value is not None},
+            "start": {key: value for key, value in start.items() if value is not None},
+        }
+        return Scene.from_document(document, self.folder)
 
     def with_start(self, base: ArrayLike | None = None, arm: ArrayLike | None = None) -> Scene:
         """Return the scene with another start.

@@ -20,7 +20,8 @@ class PhaseSpan:
     Attributes:
         name: Name of the phase, e.g. "reach door.handle".
         first, last: Its first and last waypoint; the next phase begins at `last`.
-        holds: Holds during the phase, each after the one it depends on.
+        holds: Holds during the phase, each after the one it depends on; `"cup" in phase.holds` is
+            whether the cup is held.
         opening: Gripper opening [m]; None: as in the robot's rest configuration. From another
             opening, the fingers move between the first two waypoints.
 

@@ -15,6 +15,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
+from vkc_pin.utils.arguments import check_choice
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.grafting import graft, graft_geometry
@@ -27,7 +28,13 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.free_objects import FreeObjects, to_free_joint_positions
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["FREE_JOINT", "World", "compute_final_scene", "find_coordinate_units"]
+__all__ = [
+    "FREE_JOINT",
+    "World",
+    "compute_final_scene",
+    "compute_frame_placement",
+    "find_coordinate_units",
+]
 
 FREE_JOINT = "placement"
 """Name of a free object's free joint: `<object>.placement`."""
@@ -194,6 +201,37 @@ def _compute_finger_positions(
         values += [before if still else here, here, here]
         before = here
     return np.column_stack([np.interp(times, moments, column) for column in np.array(values).T])
+
+
+def compute_frame_placement(
+    scene: Scene, trajectory: Trajectory, frame: str | None, time: float
+) -> pin.SE3:
+    """Return the placement of a frame in the world at a time of a motion [s].
+
+    Args:
+        scene: Scene of the motion.
+        trajectory: The motion.
+        frame: Frame of the robot, "<object>.<link>" or "<object>"; None: the tool frame.
+        time: [s].
+
+    Raises:
+        UnknownNameError: There is no such frame.
+    """
+    links = {
+        f"{name}.{link}": f"{name}.{link}"
+        for name, placed in scene.objects.items()
+        for link in placed.object.links
+    }
+    bases = {name: f"{name}.{placed.object.base_link}" for name, placed in scene.objects.items()}
+    robot = {name: name for name in scene.robot.frame_names}
+    known = {**links, **bases, **robot}
+    wanted = scene.robot.tool_frame if frame is None else frame
+    check_choice(wanted, known, "frame", "frame")
+    world = World(scene)
+    (row,) = world.compute_positions(trajectory, [time])
+    data = world.model.createData()
+    pin.framesForwardKinematics(world.model, data, world.coordinates.q(row))
+    return data.oMf[world.model.getFrameId(known[wanted])].copy()
 
 
 def make_scene_at(scene: Scene, world: World, row: Floats, values: Mapping[str, float]) -> Scene:

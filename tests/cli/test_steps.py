@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from helpers.commands import RunCommand
 
@@ -69,3 +71,14 @@ def test_an_object_is_grasped_from_the_command_line(run: RunCommand) -> None:
     plan = vkc.Plan.load("stick.npz")
     assert list_data(*plan.steps) == list_data(vkc.Grasp("stick", "grip"))
     assert plan.end_scene().held == {"stick": "grip"}
+
+
+def test_another_robot_plans_in_the_scene(run: RunCommand, tmp_path: Path) -> None:
+    (tmp_path / "tall.yaml").write_text(f"urdf: {vkc.load_robot('husky_ur5e').urdf}\n")
+    result = run("plan drawer --robot tall.yaml --go-to 0 0 0 --save tall.npz --quiet")
+    assert result.code == 0, result.err
+    plan = vkc.Plan.load("tall.npz")
+    assert (plan.scene.robot.name, plan.scene.robot.base) == ("tall", "omni")
+    result = run("plan drawer --robot husky --go-to 0 0 0")
+    assert result.code == 2
+    assert "did you mean" in result.err

@@ -83,8 +83,13 @@ def _plan(arguments: argparse.Namespace) -> int:
             )
         outputs["plots"] = str(Path(folder, "joints.png"))
     _check_outputs(outputs, SCENE=arguments.scene)
+    scene = vkc.load_scene(arguments.scene)
+    if arguments.robot is not None:
+        radius = scene.robot.turning_radius or None
+        base = scene.robot.base
+        scene = scene.with_robot(arguments.robot, base=base, turning_radius=radius)
     plan = vkc.plan(
-        vkc.load_scene(arguments.scene),
+        scene,
         steps,
         initialization=arguments.initialization,
         time_limit=arguments.time_limit,
@@ -320,6 +325,8 @@ def _add_plan(commands: Any) -> None:
     )
     plan = add_command(commands, "plan", "plan a motion", _plan, about)
     add_option(plan, "scene SCENE", "name of an included scene, or a YAML file")
+    about = "another robot: a name, folder, robot.yaml or URDF (default: the scene's)"
+    add_option(plan, "--robot ROBOT", about)
     add_steps(plan)
     for form, text in (_OUTPUTS | _EXPORTS).items():
         add_option(plan, form, text)

@@ -45,6 +45,7 @@ __all__ = [
     "MODEL_ERROR",
     "ClearanceExemption",
     "ClosePair",
+    "NearStretch",
     "PlacedShapes",
     "find_clearance_exemptions",
     "find_close_pairs",

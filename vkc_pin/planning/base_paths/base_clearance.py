@@ -16,6 +16,8 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.world.collision.distances import compute_distance
+from vkc_pin.world.collision.solids import convert_solid, flatten_placements
 
 __all__ = ["DIRECTIONS", "MovingShapes", "Obstacles", "Shape", "compute_hull_points"]
 
@@ -45,14 +47,17 @@ class Obstacles:
     """Obstacles in the world.
 
     Attributes:
-        shapes: Convex shapes and their placements.
+        solids: Results of `convert_solid`, and placements, shape (12,) each.
         support: Support functions along `DIRECTIONS`, shape (S, 32) [m].
         extent: Support functions along the world axes, shape (S, 4) [m].
         height: Lowest and highest z, shape (S, 2) [m].
     """
 
     def __init__(self, shapes: Sequence[Shape]) -> None:
-        self.shapes = [(shape, _transform(placement)) for shape, placement in shapes]
+        self.solids = [
+            (convert_solid(shape), flatten_placements([placement])[0])
+            for shape, placement in shapes
+        ]
         self.support = np.empty((len(shapes), len(DIRECTIONS)))
         self.height = np.empty((len(shapes), 2))
         for s, (shape, placement) in enumerate(shapes):
@@ -72,7 +77,7 @@ class MovingShapes:
 
     def __init__(self, shapes: Sequence[Shape], world: Obstacles, margin: float) -> None:
         self.world, self.margin = world, margin
-        self.shapes = [(shape, _transform(placement)) for shape, placement in shapes]
+        self._solids = [(convert_solid(shape), placement) for shape, placement in shapes]
         outlines = [compute_hull_points(*placed, outer=True) for placed in shapes]
         radius = np.array([radius for _, radius in outlines])
         low = np.array([points[:, 2].min() for points, _ in outlines]) - radius
@@ -80,7 +85,7 @@ class MovingShapes:
         self.reach = np.array([np.hypot(*points[:, :2].T).max() for points, _ in outlines]) + radius
         gaps = np.maximum(low[:, None] - world.height[:, 1], world.height[:, 0] - high[:, None])
         self.moving, self.standing = np.nonzero(gaps < margin)
-        self.exclusion_radius = np.full(len(world.shapes), -np.inf)
+        self.exclusion_radius = np.full(len(world.solids), -np.inf)
         np.maximum.at(self.exclusion_radius, self.standing, self.reach[self.moving] + margin)
         self._points = np.concatenate(
             [np.empty((0, 2)), *(points[:, :2] for points, _ in outlines)]
@@ -88,11 +93,10 @@ class MovingShapes:
         self._first_point = np.cumsum([0, *(len(points) for points, _ in outlines)])[:-1]
         self._radius = radius[:, None]
         self._tables: dict[tuple[float, float], Floats] = {}
-        self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
         order = np.argsort(self.standing, kind="stable")
-        edges = np.searchsorted(self.standing[order], np.arange(1, len(world.shapes)))
+        edges = np.searchsorted(self.standing[order], np.arange(1, len(world.solids)))
         self._pairs_by_obstacle = np.split(order, edges)
-        self._margins = np.full(len(world.shapes), margin)
+        self._margins = np.full(len(world.solids), margin)
 
     def is_drive_free(
         self, a: Floats, b: Floats, yaw: float, margins: Floats | None = None
@@ -242,18 +246,14 @@ class MovingShapes:
 
     def _compute_distance(self, row: int, at: Floats, yaw: float) -> tuple[float, Floats]:
         """Return the distance of a pair at a base pose [m], and its normal in the plane, (2,)."""
-        shape, placement = self.shapes[self.moving[row]]
-        other, where = self.world.shapes[self.standing[row]]
+        solid, placement = self._solids[self.moving[row]]
         cosine, sine = math.cos(yaw), math.sin(yaw)
         turned = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-        self._result.clear()
-        there = coal.Transform3s(turned, np.array([at[0], at[1], 0.0])) * placement
-        distance = coal.distance(shape, there, other, where, self._request, self._result)
-        return distance, self._result.normal[:2].copy()
-
-
-def _transform(placement: pin.SE3) -> coal.Transform3s:
-    return coal.Transform3s(placement.rotation, placement.translation)
+        moved = pin.SE3(turned, np.array([at[0], at[1], 0.0])) * placement
+        where = flatten_placements([moved])[0]
+        standing = self.world.solids[self.standing[row]]
+        distance, normal = compute_distance(solid, where, *standing)
+        return distance, normal[:2]
 
 
 def compute_hull_points(

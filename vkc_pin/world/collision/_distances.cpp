@@ -36,6 +36,7 @@ NB_MODULE(_distances, module)
     .def("placed", &Shapes::placed)
     .def("distances", &Shapes::distances)
     .def("shortest", &Shapes::shortest);
+  module.def("distance", &distance);
   module.def("asked", [] { return asked.load(); });
   nb::class_<Boxes>(module, "Boxes")
     .def(

@@ -1,4 +1,8 @@
-"""Computes signed distances of pairs of shapes, and finds those that violate their margins most."""
+"""Computes signed distances of pairs of shapes, and finds those that violate their margins most.
+
+Distances are coal's, except where its closed forms for spheres and capsules are wrong: when their
+centres or axes lie inside the other shape (`overlaps.hpp`).
+"""
 
 from __future__ import annotations
 
@@ -27,6 +31,7 @@ __all__ = [
     "Margins",
     "Shapes",
     "Witnesses",
+    "compute_distance",
     "count_distance_queries",
 ]
 
@@ -54,16 +59,16 @@ class Witnesses(NamedTuple):
 class Shapes:
     """G shapes between which coal computes distances: first the M moving ones, then the fixed ones.
 
-    Distances equal those of `coal.distance` with a fresh result bit for bit, for any number of
-    threads. A state is the placements of the moving shapes in the world frame, shape (M, 12), in
-    the format of `solids.flatten_placements`.
+    Distances are independent of earlier ones and of the number of threads. A state is the
+    placements of the moving shapes in the world frame, shape (M, 12), in the format of
+    `solids.flatten_placements`.
 
     Args:
         geometries: coal's shapes, moving ones first.
         fixed: Placements of the fixed shapes in the world frame.
         tolerance: Tolerance of GJK. With 1e-8, normals are accurate enough for gradients; with
             coal's default of 1e-6, they are off by up to 5e-3. Both take the same time. EPA keeps
-            its default, since below 1e-6 it fails for cylinders.
+            its default tolerance, since below 1e-6 it fails for cylinders.
         threads: Maximum number of threads. Default: `solids.count_threads`.
     """
 
@@ -155,6 +160,24 @@ class Shapes:
 
 def _to_witnesses(table: Floats) -> Witnesses:
     return Witnesses(table[:, 0], table[:, 1:4], table[:, 4:7], table[:, 7:10])
+
+
+def compute_distance(
+    first: Any, first_placement: Floats, second: Any, second_placement: Floats
+) -> tuple[float, Floats]:
+    """Compute the signed distance of two solids.
+
+    Args:
+        first: Result of `solids.convert_solid`.
+        first_placement: Row of `solids.flatten_placements`, shape (12,).
+        second: The other solid.
+        second_placement: Its placement.
+
+    Returns:
+        The distance [m], and the unit normal from the first to the second solid, shape (3,).
+    """
+    row = load_compiled().distance(first, first_placement, second, second_placement, TOLERANCE)
+    return float(row[0]), row[1:4]
 
 
 def count_distance_queries() -> int:

@@ -17,6 +17,7 @@
 
 #include "arrays.hpp"
 #include "bodies.hpp"
+#include "overlaps.hpp"
 #include "solids.hpp"
 
 namespace {
@@ -28,6 +29,12 @@ coal::Transform3s transform(const double * numbers)
 {
   return coal::Transform3s(
     Eigen::Map<const Eigen::Matrix3d>(numbers), Eigen::Map<const Eigen::Vector3d>(numbers + 9));
+}
+
+void copy_witness(const coal::DistanceResult & result, double * out)
+{
+  for (const coal::Vec3s * numbers : {&result.normal, &result.nearest_points[0], &result.nearest_points[1]})
+    out = std::copy_n(numbers->data(), 3, out);
 }
 
 std::atomic<std::uint64_t> asked{0}; // number of distances computed since the process began
@@ -79,8 +86,7 @@ public:
       ++count_;
       result_.clear();
       const auto &one = place(std::size_t(first)), &other = place(std::size_t(second));
-      return coal::distance(
-        shapes_.shapes_[first].get(), one, shapes_.shapes_[second].get(), other, request_, result_);
+      return signed_distance(*shapes_.shapes_[first], one, *shapes_.shapes_[second], other, request_, result_);
     }
 
     // Of candidates sorted by their bounds, selects at most `most` closer than `reach` with least
@@ -109,11 +115,7 @@ public:
         near.resize(most);
     }
 
-    void witness(double * out) const
-    {
-      for (const coal::Vec3s * numbers : {&result_.normal, &result_.nearest_points[0], &result_.nearest_points[1]})
-        out = std::copy_n(numbers->data(), 3, out);
-    }
+    void witness(double * out) const { copy_witness(result_, out); }
 
   private:
     const coal::Transform3s & place(std::size_t shape)
@@ -146,7 +148,7 @@ public:
     moving_ = shapes_.size() - standing.shape(0);
     for (std::size_t i = 0; i < standing.shape(0); ++i)
       standing_.push_back(transform(standing.data() + PLACEMENT * i));
-    request_.gjk_tolerance = tolerance;
+    request_ = make_request(tolerance);
   }
 
   Shapes placed(const Indices<1> & which, const Numbers<2> & where) const
@@ -272,5 +274,20 @@ private:
   std::size_t moving_;
   coal::DistanceRequest request_;
 };
+
+// The distance of two shapes with normal and witness points; placements are of shape (12,).
+Array<double> distance(
+  const Solid & one, const Numbers<1> & where, const Solid & other, const Numbers<1> & there, double tolerance)
+{
+  if (where.shape(0) != PLACEMENT || there.shape(0) != PLACEMENT)
+    throw std::invalid_argument("placements are of shape (12,)");
+  std::vector<double> found(COLUMNS);
+  coal::DistanceResult result;
+  found[0] = signed_distance(
+    *one.geometry, transform(where.data()), *other.geometry, transform(there.data()), make_request(tolerance), result);
+  copy_witness(result, found.data() + 1);
+  ++asked;
+  return handed_over(std::move(found), {COLUMNS});
+}
 
 } // namespace

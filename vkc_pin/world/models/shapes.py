@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arrays import Bools, Floats, Ints
+from vkc_pin.world.collision.distances import compute_distance
+from vkc_pin.world.collision.solids import convert_solid, flatten_placements
 from vkc_pin.world.files.meshes import get_triangles
 from vkc_pin.world.models.grafting import round_placement
 
@@ -133,11 +135,8 @@ def compute_shape_distance(
     second_placement: pin.SE3,
 ) -> float:
     """Return the signed distance between two shapes at placements in a common frame [m]."""
-    a, b = (
-        coal.Transform3s(where.rotation, where.translation)
-        for where in (first_placement, second_placement)
-    )
-    return float(coal.distance(first, a, second, b, coal.DistanceRequest(), coal.DistanceResult()))
+    where, there = flatten_placements([first_placement, second_placement])
+    return compute_distance(convert_solid(first), where, convert_solid(second), there)[0]
 
 
 def triangulate(shape: coal.CollisionGeometry) -> tuple[Floats, NDArray[np.int64]]:
@@ -210,21 +209,21 @@ class ShapeDistances:
         shapes: Sequence[pin.GeometryObject],
     ) -> None:
         self._model, self._configuration, self._data = model, configuration, model.createData()
-        self._solids = [shape.geometry for shape in shapes]
+        geometries = [shape.geometry for shape in shapes]
+        self._solids = [convert_solid(geometry) for geometry in geometries]
         self._joints = np.array([shape.parentJoint for shape in shapes])
         self._locals = [shape.placement for shape in shapes]
-        for solid in self._solids:
-            solid.computeLocalAABB()
-        self._radii = np.array([solid.aabb_radius for solid in self._solids])
+        for geometry in geometries:
+            geometry.computeLocalAABB()
+        self._radii = np.array([geometry.aabb_radius for geometry in geometries])
         self._middles = np.array(
             [
-                place.act(solid.aabb_center)
-                for place, solid in zip(self._locals, self._solids, strict=True)
+                place.act(geometry.aabb_center)
+                for place, geometry in zip(self._locals, geometries, strict=True)
             ]
         )
         self._turns = np.array([place.rotation for place in self._locals])
-        self._halves = np.array([_get_half_extents(solid) for solid in self._solids])
-        self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
+        self._halves = np.array([_get_half_extents(geometry) for geometry in geometries])
 
     def set_configuration(self, z: Floats) -> None:
         """Set the model to the minimal coordinates `z`, shape (n,)."""
@@ -233,7 +232,7 @@ class ShapeDistances:
         positions = np.array([place.translation for place in self._data.oMi])[self._joints]
         self._centres = np.einsum("kij,kj->ki", rotations, self._middles) + positions
         self._verticals = rotations[:, 2]
-        self._places: dict[int, coal.Transform3s] = {}
+        self._places: dict[int, Floats] = {}
 
     def compute_lowest_points(self) -> Floats:
         """Return the lowest height of each shape's bounding box, shape (shapes,) [m]."""
@@ -258,19 +257,18 @@ class ShapeDistances:
             gap = self._centres[first] - self._centres[second]
             bound = float(np.sqrt(gap @ gap) - self._radii[first] - self._radii[second])
             if bound <= min(smallest, cutoff):
-                self._result.clear()
                 one, other = (
                     (self._solids[shape], self._compute_placement(shape))
                     for shape in (first, second)
                 )
-                bound = coal.distance(*one, *other, self._request, self._result)
-            smallest = min(smallest, float(bound))
+                bound, _ = compute_distance(*one, *other)
+            smallest = min(smallest, bound)
         return smallest
 
-    def _compute_placement(self, shape: int) -> coal.Transform3s:
+    def _compute_placement(self, shape: int) -> Floats:
         if shape not in self._places:
             place = self._data.oMi[int(self._joints[shape])] * self._locals[shape]
-            self._places[shape] = coal.Transform3s(place.rotation, place.translation)
+            self._places[shape] = flatten_placements([place])[0]
         return self._places[shape]
 
 

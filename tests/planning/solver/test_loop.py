@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from helpers.carrying import describe_box
 from helpers.drives import make_hall
-from helpers.small_problems import make_program
+from helpers.judging import replace_attachments
+from helpers.small_problems import load_door_scene, make_program
 from helpers.straight_drives import make_straight_drive
 
 import vkc_pin as vkc
@@ -33,6 +34,7 @@ from vkc_pin.planning.solver.trust_region import (
     SETTLE_RADIUS,
 )
 from vkc_pin.utils.budget import Budget
+from vkc_pin.world.scene.contact_rules import find_grasp_distances
 
 FEW = vkc.Options(reach_waypoints=20, max_outer=12)
 
@@ -301,3 +303,17 @@ def test_feasible_motion_is_kept_if_the_budget_ends() -> None:
     assert solution.rounds < whole.rounds
     assert (solution.converged, solution.status) == (True, "converged")
     check_feasible(make_roadside_case()[0], solution)
+
+
+@pytest.mark.parametrize("lacking", [-1e-4, 2e-4, 6e-4, 9e-4])
+def test_motions_converge_with_grasps_that_validation_accepts(lacking: float) -> None:
+    """No motion changes how far the hand is from what it grasps."""
+    scene = load_door_scene()
+    least = min(find_grasp_distances(scene, vkc.Hold("door", "handle")).values())
+    handle = scene.objects["door"].object.attachments["handle"]
+    strict = dataclasses.replace(handle, clearance=least + lacking)
+    scene = replace_attachments(scene, {"handle": strict})
+    steps = [vkc.Actuate("door", {"hinge": 0.4}, "handle")]
+    options = vkc.Options(dist_safe=0.03, reach_waypoints=20)
+    problem = make_program(scene, steps, options=options)
+    assert solve(problem, next(initialize(problem, "interpolated", 0)).z).converged

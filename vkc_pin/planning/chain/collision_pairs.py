@@ -25,11 +25,16 @@ from vkc_pin.world.models.shapes import (
     get_link_name,
     get_local_name,
 )
-from vkc_pin.world.scene.clearance_exemptions import find_clearance_exemptions, make_shape_keys
+from vkc_pin.world.scene.clearance_exemptions import (
+    ACCEPTED_SHORTFALL,
+    find_clearance_exemptions,
+    make_shape_keys,
+)
 from vkc_pin.world.scene.contact_rules import (
     CONTACT_DEPTH,
     CONTACT_WINDOW,
     compute_hand_clearance,
+    find_grasp_distances,
     find_grasped_link,
     find_touch_links,
     is_rigid_grasp,
@@ -178,7 +183,7 @@ def find_reduced_margins(
             is_object = np.array([label.startswith(f"{hold.object}.") for label in part.labels])
             found = np.flatnonzero(is_hand[part.pairs[:, 0]] & is_object[part.pairs[:, 1]])
             for k in found.tolist():
-                margin = compute_hand_clearance(scene, hold, part.labels[part.pairs[k, 1]], options)
+                margin = _compute_hand_margin(scene, hold, part.labels[part.pairs[k, 1]], options)
                 reduced.setdefault(k, []).append((*windows[begins], margin))
     reach = float(part.margins.max())
     for moving, shape, where, begins, may_overlap in itertools.chain(
@@ -194,6 +199,17 @@ def find_reduced_margins(
             if distance < part.margins[k]:
                 reduced.setdefault(k, []).append((*windows[begins], margin))
     return reduced
+
+
+def _compute_hand_margin(scene: Scene, hold: Hold, link: str, options: Options) -> float:
+    """Return the clearance that a hand keeps from a link of the object that it grasps [m].
+
+    Where the grasp fixes a smaller distance that validation still accepts, no motion improves it;
+    the solver, which tolerates half as much, could not converge.
+    """
+    margin = compute_hand_clearance(scene, hold, link, options)
+    fixed = find_grasp_distances(scene, hold).get(link, np.inf)
+    return min(margin, max(fixed, margin - ACCEPTED_SHORTFALL / 2))
 
 
 def _find_touches(
@@ -457,7 +473,7 @@ class _PairBuilder:
         if one not in find_touch_links(self.scene, hold):
             return self.options.dist_safe
         if link != find_grasped_link(self.scene, hold):
-            return compute_hand_clearance(self.scene, hold, link, self.options)
+            return _compute_hand_margin(self.scene, hold, link, self.options)
         if is_rigid_grasp(self.scene, hold):
             return -np.inf
         return compute_hand_clearance(self.scene, hold, link, self.options) or -CONTACT_DEPTH

@@ -30,8 +30,9 @@ grasped or released, and before the motion; after the last grasp it stays.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
+import coal
 import numpy as np
 import pinocchio as pin
 
@@ -51,11 +52,14 @@ __all__ = [
     "compute_hand_clearance",
     "compute_hand_frame",
     "compute_start_opening",
+    "find_grasp_distances",
     "find_grasped_link",
     "find_gripper_hold",
     "find_touch_links",
     "is_rigid_grasp",
 ]
+
+PlacedShape = tuple[coal.CollisionGeometry, pin.SE3]
 
 CONTACT_WINDOW = 1.0
 """Time before and after a contact in which shapes may be close [s]."""
@@ -93,6 +97,22 @@ def compute_hand_clearance(scene: Scene, hold: Hold, link: str, options: Options
     return min(nominal, measured - CONTACT_DEPTH)
 
 
+def find_grasp_distances(scene: Scene, hold: Hold) -> Mapping[str, float]:
+    """Return the distances that a grasp without freedoms fixes, with the object as at the start.
+
+    Returns:
+        Link of the object → its distance from the grasping links [m]; empty for other grasps.
+    """
+    attachment = _get_attachment(scene, hold)
+    if hold.by is not None or attachment.freedoms or attachment.contact == "push":
+        return {}
+    placed, links = scene.objects[hold.object], find_touch_links(scene, hold)
+    key = (hold.object, hold.attachment, "grasp", make_state_key(placed))
+    return get_cached(
+        scene, key, lambda: _compute_distances(_place_hand(scene, hold, placed, links), placed)
+    )
+
+
 def _measure_hand_distances(scene: Scene, hold: Hold) -> Mapping[str, float]:
     """Return link → distance of the grasping links in a measured grasp of the scene's start [m].
 
@@ -115,26 +135,44 @@ def _compute_hand_distances(
         ]
         hands = list_placed_shapes(hand)
     else:
-        attachment, robot = get_attachment(scene.objects, hold), scene.robot
-        grasp = placed.link_placement(attachment.link) * attachment.tool(hold.at)
-        to_grasp = grasp * scene.tool_placement().inverse()
-        geometry = robot.opened(compute_grasp_opening(scene, hold)).collision
-        data, shapes = robot.model.createData(), geometry.createData()
-        pin.updateGeometryPlacements(
-            robot.model, data, geometry, shapes, robot.coordinates.q(scene.start)
-        )
-        hands = [
-            (geometry.geometryObjects[i].geometry, moved * shapes.oMg[i])
-            for i in range(len(shapes.oMg))
-            if robot.link_of(i) in links
-            for moved in (pin.SE3.Identity(), to_grasp)
-        ]
+        hands = _place_hand(scene, hold, placed, links, include_start=True)
+    return _compute_distances(hands, placed)
+
+
+def _place_hand(
+    scene: Scene,
+    hold: Hold,
+    placed: PlacedObject,
+    links: Collection[str],
+    *,
+    include_start: bool = False,
+) -> list[PlacedShape]:
+    """Return the shapes of the grasping links in the grasp, and as at the start if asked to."""
+    attachment, robot = get_attachment(scene.objects, hold), scene.robot
+    grasp = placed.link_placement(attachment.link) * attachment.tool(hold.at)
+    to_grasp = grasp * scene.tool_placement().inverse()
+    geometry = robot.opened(compute_grasp_opening(scene, hold)).collision
+    data, shapes = robot.model.createData(), geometry.createData()
+    pin.updateGeometryPlacements(
+        robot.model, data, geometry, shapes, robot.coordinates.q(scene.start)
+    )
+    moves = [pin.SE3.Identity(), to_grasp] if include_start else [to_grasp]
+    return [
+        (geometry.geometryObjects[i].geometry, moved * shapes.oMg[i])
+        for i in range(len(shapes.oMg))
+        if robot.link_of(i) in links
+        for moved in moves
+    ]
+
+
+def _compute_distances(hands: Sequence[PlacedShape], placed: PlacedObject) -> Mapping[str, float]:
+    """Return link of an object → its distance from some shapes [m]."""
     found: dict[str, list[pin.GeometryObject]] = {}
     for shape in make_world_shapes(placed):
-        found.setdefault(f"{hold.object}.{get_link_name(shape.name)}", []).append(shape)
+        found.setdefault(get_link_name(shape.name), []).append(shape)
     return {
-        label: compute_clearance(hands, list_placed_shapes(shapes))
-        for label, shapes in found.items()
+        f"{placed.name}.{link}": compute_clearance(hands, list_placed_shapes(shapes))
+        for link, shapes in found.items()
     }
 
 

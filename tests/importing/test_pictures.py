@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -51,14 +52,53 @@ def test_picture_shows_objects_that_no_hand_can_open(
     found = vkc.importing.propose_attachments(item)
     assert not found.found
     assert bool(found.rejected.get("top")) is tried
-    whole, explanation = plot_attachments(found).axes
+    figure = plot_attachments(found)
+    (whole,) = figure.axes
     assert ("places tried" in whole.get_title()) is tried
     longest = max(width, depth, height + thick)
     assert np.ptp(whole.get_xlim()) == pytest.approx(longest, rel=0.1)
     assert len(whole.collections) == (3 if tried else 1)  # the shapes, and tried places with arrows
-    text = explanation.texts[0].get_text().replace("\n", " ")
+    text = figure.subfigs[1].texts[0].get_text().replace("\n", " ")
     assert text.startswith("No hand can open")
     assert ("300 mm at its thinnest" in text) == (thick == 0.3)
+
+
+LONG = "of 28 places that are thin enough, 16 are not 20 mm from body, 5 are not 5 mm from left"
+REASONS = {
+    "one": {"slide": LONG},
+    "eight of one reason": {f"drawer_slide_{k}": LONG for k in range(8)},
+    "eight of two reasons": {f"drawer_slide_{k}": f"{k % 2:02d} {LONG}" for k in range(8)},
+    "forty reasons": {f"slide_{k}": f"{k:02d} {LONG}" for k in range(40)},
+    "long names": {f"{'name_of_a_joint_' * 12}{k}": f"{k:02d} {LONG}" for k in range(6)},
+}
+
+
+@pytest.mark.parametrize("with_grasps", [True, False], ids=["some", "none"])
+@pytest.mark.parametrize("because", REASONS.values(), ids=REASONS)
+def test_picture_has_room_for_every_reason(
+    with_grasps: bool, because: dict[str, str], tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
+    """The object is as large as with one reason, and no text is cut off."""
+    found = vkc.importing.propose_attachments(write_flap(tmp_path, BAR.format("")))
+    kept = found.found if with_grasps else ()
+    figure = plot_attachments(
+        dataclasses.replace(found, because=because, found=kept), tmp_path / "a.png"
+    )
+    assert not [str(warning.message) for warning in recwarn if "layout" in str(warning.message)]
+    (words,) = figure.subfigs[1].texts
+    everything = words.get_text().replace("\n", " ")
+    for joint, reason in because.items():
+        assert joint in everything.replace(" ", "")
+        assert everything.count(reason) == 1
+    box = words.get_window_extent()
+    assert box.x0 >= 0.0
+    assert box.y0 >= 0.0
+    assert box.x1 <= figure.bbox.x1
+    whole = figure.axes[-1]
+    assert whole.get_title().startswith("closed")
+    place = whole.get_window_extent()
+    assert min(place.width, place.height) > 2.0 * figure.dpi
+    assert place.y0 > box.y1
 
 
 @pytest.mark.parametrize("name", ["husky_ur5e", "panda"])

@@ -28,7 +28,9 @@ __all__ = ["Triangles", "plot_attachments", "plot_robot", "to_rgb"]
 _PANELS = 12  # largest number of panels
 _COLUMNS = 4
 _WIDTH = 3.2  # [inch] of a panel
-_LETTERS = 48  # in a line of its text
+_FONT = 8  # [pt] of titles and reasons
+_LETTERS = 38  # across a panel: rounded to pixels, monospaced ones are up to 0.72 of _FONT wide
+_LINE = 1.25 * _FONT / 72.0  # [inch] height of a line of text, with rounding to pixels
 _PLACES = 60  # largest number of drawn places that were tried
 _ARROW = 0.06  # [m] length of their arrows
 _FACET = 0.05  # [m] approximate edge length of drawn triangles
@@ -49,7 +51,7 @@ def plot_attachments(proposals: Proposals, path: str | Path | None = None) -> Fi
     """Draw the hand at every proposed attachment, and list the joints that no hand can open.
 
     Joints are drawn a third open. If there are such joints, the closed object is drawn with its
-    size, the links that they move, and the places that were tried.
+    size, the links that they move, and the places that were tried, and the reasons are below.
 
     Args:
         proposals: Result of `propose_attachments`.
@@ -61,40 +63,53 @@ def plot_attachments(proposals: Proposals, path: str | Path | None = None) -> Fi
     check_instance(proposals, Proposals, "proposals")
     drawn = proposals.found[:_PANELS]
     fails = bool(proposals.because) or not drawn
-    panels = len(drawn) + 2 * fails
+    panels = len(drawn) + fails
     columns = min(panels, _COLUMNS)
     rows = -(-panels // columns)
+    # Reasons stand below all panels, in lines of at least the width of two.
+    width = max(columns, 2 if fails else 1)
+    lines = _format_reasons(proposals, width * _LETTERS) if fails else []
+    panels_height = _WIDTH * rows + 0.3
+    reasons_height = _LINE * (len(lines) + 1) if fails else 0.0
     with use_style():
-        figure = new_figure(_WIDTH * columns, _WIDTH * rows + 0.3)
+        figure = new_figure(_WIDTH * width, panels_height + reasons_height)
+        pictures: Any = figure
+        if fails:
+            parts: Any = figure.subfigures(2, 1, height_ratios=(panels_height, reasons_height))
+            pictures, words = parts
+            style = {"fontsize": _FONT, "family": "monospace", "linespacing": 1.2}
+            words.text(0.02, 1.0, "\n".join(lines), va="top", **style)
         for number, proposal in enumerate(drawn):
-            axes: Any = figure.add_subplot(rows, columns, number + 1, projection="3d")
+            axes: Any = pictures.add_subplot(rows, columns, number + 1, projection="3d")
             joint = list(proposal.opens)[-1]
             _draw(axes, proposals, proposal, joint)
             opened = ", ".join(f"{name} to {value:.2g}" for name, value in proposal.opens.items())
             axes.set_title(
-                f"{proposal.attachment.name}  {proposal.score:.2f}\n{opened}", fontsize=8
+                f"{proposal.attachment.name}  {proposal.score:.2f}\n{opened}", fontsize=_FONT
             )
         if fails:
-            whole: Any = figure.add_subplot(rows, columns, panels - 1, projection="3d")
+            whole: Any = pictures.add_subplot(rows, columns, panels, projection="3d")
             _draw_closed(whole, proposals)
-            words: Any = figure.add_subplot(rows, columns, panels)
-            words.axis("off")
-            reasons = (
-                "\n\n".join(f"{joint}: {reason}" for joint, reason in proposals.because.items())
-                or "it has no joints"
-            )
-            text = "\n".join(
-                textwrap.fill(line, _LETTERS)
-                for line in f"No hand can open\n\n{reasons}".split("\n")
-            )
-            words.text(0.0, 1.0, text, va="top", fontsize=8)
         more = len(proposals.found) - len(drawn)
-        figure.suptitle(
+        pictures.suptitle(
             f"{proposals.object.name}, hand of {proposals.hand.robot}"
             + (f" ({more} more)" if more else ""),
             fontsize=10,
         )
     return save_figure(figure, path)
+
+
+def _format_reasons(proposals: Proposals, letters: int) -> list[str]:
+    """Return lines about the joints that no hand can open; joints of one reason are together."""
+    joints_by_reason: dict[str, list[str]] = {}
+    for joint, reason in proposals.because.items():
+        joints_by_reason.setdefault(reason, []).append(joint)
+    if not joints_by_reason:
+        return ["No hand can open it: it has no joints"]
+    lines = ["No hand can open"]
+    for reason, joints in joints_by_reason.items():
+        lines += ["", *textwrap.wrap(f"{', '.join(joints)}: {reason}", letters)]
+    return lines
 
 
 def _draw_closed(axes: Any, proposals: Proposals) -> None:
@@ -117,7 +132,7 @@ def _draw_closed(axes: Any, proposals: Proposals) -> None:
         direction = np.array([-1.0, 0.0, 0.0])
     triangles.draw(axes, direction, ticks=True)
     count = f", {len(places)} places tried" if places else ""
-    axes.set_title(f"closed{count} [m]", fontsize=8)
+    axes.set_title(f"closed{count} [m]", fontsize=_FONT)
 
 
 def _draw(axes: Any, proposals: Proposals, proposal: Proposal, joint: str) -> None:

@@ -157,18 +157,19 @@ def _import_robot(arguments: argparse.Namespace) -> int:
 def _import_object(arguments: argparse.Namespace) -> int:
     from vkc_pin.importing.objects.object_import import import_object
 
-    done = import_object(
-        arguments.file,
-        arguments.output,
-        height=arguments.height,
-        scale=arguments.scale,
-        up=arguments.up,
-        link=arguments.link,
-        robot=_find_robot(arguments.robot),
-        most=arguments.most,
-        force=arguments.force,
-        **_read_packages(arguments),
-    )
+    with _print_progress():
+        done = import_object(
+            arguments.file,
+            arguments.output,
+            height=arguments.height,
+            scale=arguments.scale,
+            up=arguments.up,
+            link=arguments.link,
+            robot=_find_robot(arguments.robot),
+            most=arguments.most,
+            force=arguments.force,
+            **_read_packages(arguments),
+        )
     written = [done.file, done.picture, *([] if done.scene is None else [done.scene])]
     lines = "".join(f"wrote {file}\n" for file in written)
     sys.stdout.write(f"{done.summary()}\n{lines}{_suggest_plan(done)}")

@@ -13,11 +13,12 @@ import vkc_pin as vkc
 from vkc_pin.importing.homes.splitting import Home, HomeObject
 from vkc_pin.importing.homes.writing import (
     ImportedHomeObject,
-    ImportProgress,
+    measure_parts,
     write_object,
     write_obstacles,
 )
 from vkc_pin.importing.objects.description import Link
+from vkc_pin.importing.progress import ImportProgress
 from vkc_pin.world.models.articulated_object import ArticulatedObject
 
 SETTINGS = {"stem": "can", "most": 2, "dist_safe": 0.02, "grasp_clearance": 0.005}
@@ -74,7 +75,7 @@ def test_primitive_shapes_are_kept_and_meshes_become_urdf(tmp_path: Path) -> Non
     home = Home((building,), (mesh, ball), (), (), 4, ())
     taken = {"ball", "wedge"}
     entries, links, notes = write_obstacles(
-        home, tmp_path / "home.urdf", tmp_path, taken, {}, ImportProgress(home)
+        home, tmp_path / "home.urdf", tmp_path, taken, {}, ImportProgress(measure_parts(home))
     )
     assert [entry["name"] for entry in entries] == ["a_wall", "walls_1", "wedge_2", "a_wall_2"]
     assert [entry["type"] for entry in entries] == ["box", "capsule", "urdf", "sphere"]
@@ -95,19 +96,3 @@ def test_primitive_shapes_are_kept_and_meshes_become_urdf(tmp_path: Path) -> Non
         assert np.vstack([box.min_, box.max_]) == pytest.approx(bounds, abs=2e-3)
         if part.kind != "mesh":
             assert shape.placement.isApprox(part.placement, 1e-5)
-
-
-def test_progress_is_logged_every_few_seconds(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    links = tuple(Link(f"chair {k}", (), (make_part(),)) for k in range(6))
-    now = 0.0
-    monkeypatch.setattr("time.perf_counter", lambda: now)
-    with caplog.at_level("INFO", "vkc_pin.importing"):
-        progress = ImportProgress(Home((), links, (), (), 6, ()))
-        for number, _ in enumerate(progress.follow(links)):
-            now += (0.5, 2.0, 0.5, 3.0, 1.0, 1.0)[number]
-    assert [record.getMessage() for record in caplog.records] == [
-        "chair 2: part 3 of 6, about 5 s left",
-        "chair 4: part 5 of 6, about 3 s left",
-    ]

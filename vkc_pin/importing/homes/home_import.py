@@ -18,7 +18,7 @@ from vkc_pin.importing.homes.allowed_contacts import read_home_contacts
 from vkc_pin.importing.homes.splitting import FLOOR_RISE, Home, add_floor, split_home
 from vkc_pin.importing.homes.writing import (
     ImportedHomeObject,
-    ImportProgress,
+    measure_parts,
     write_object,
     write_obstacles,
 )
@@ -31,6 +31,7 @@ from vkc_pin.importing.objects.clean_up import (
 from vkc_pin.importing.objects.description import WEIGHTLESS
 from vkc_pin.importing.objects.object_import import read_description
 from vkc_pin.importing.objects.pieces import PieceCache
+from vkc_pin.importing.progress import ImportProgress
 from vkc_pin.importing.scenes import locate_robot, refer_to_robot, write_scene
 from vkc_pin.importing.targets import check_target
 from vkc_pin.options import Options
@@ -160,7 +161,7 @@ def import_home(  # noqa: PLR0913 - keyword options of a public call
         names = [item.name for item in home.objects]
         taken = {FLOOR, *names}
         clearances = {"dist_safe": options.dist_safe, "grasp_clearance": options.grasp_clearance}
-        progress = ImportProgress(home)
+        progress = ImportProgress(measure_parts(home))
         objects = tuple(
             write_object(item, hand, staging, cache, stem=stem, most=most, **clearances)
             for item, stem in zip(

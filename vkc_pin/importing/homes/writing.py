@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
 import tempfile
-import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -24,8 +22,9 @@ from vkc_pin.importing.objects.clean_up import (
 )
 from vkc_pin.importing.objects.description import Colour, Description, Joint, Link, Part
 from vkc_pin.importing.objects.limits import add_missing_limits
-from vkc_pin.importing.objects.pieces import PieceCache, decompose_links
+from vkc_pin.importing.objects.pieces import MeshKeys, PieceCache, decompose_links, measure_links
 from vkc_pin.importing.objects.writing import write_description, write_urdf
+from vkc_pin.importing.progress import ImportProgress
 from vkc_pin.importing.proposals.proposal import Proposals
 from vkc_pin.importing.proposals.propose import propose_attachments
 from vkc_pin.importing.targets import round_values
@@ -33,14 +32,8 @@ from vkc_pin.world.files.resources import choose_file_names
 from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.models.robot import Robot
 
-__all__ = ["ImportProgress", "ImportedHomeObject", "write_object", "write_obstacles"]
+__all__ = ["ImportedHomeObject", "measure_parts", "write_object", "write_obstacles"]
 
-T = TypeVar("T")
-_LOGGER = logging.getLogger(__name__)
-_PATIENCE = 2.0  # [s] before the first and between all progress lines
-# Triangles that take as long to cut, 0.4 ms each, as places for hands on a part are sought
-_PART_WORK = 2000.0
-_TRIANGLE_SIZE = 50.0  # [bytes] of a triangle in a binary STL file; text takes up to twice as much
 _LIFT = 0.2  # [m] by which a free object is lifted to test whether a hand can hold it
 
 
@@ -80,53 +73,11 @@ class ImportedHomeObject:
         return f"{self.name}: {'; '.join(parts)}"
 
 
-class ImportProgress:
-    """Logs the part at work, and the time left, every few seconds.
-
-    The time left is that of the parts so far for as many triangles: most of it goes into cutting
-    meshes. Copies of a mesh count once.
-
-    Args:
-        home: The home, whose parts are objects and obstacles.
-    """
-
-    def __init__(self, home: Home) -> None:
-        self.done = 0
-        meshes = set[tuple[Path, tuple[float, ...]]]()
-        obstacles = [link for _, link in _iterate_obstacle_links(home)]
-        parts: list[HomeObject | Link] = [*home.objects, *obstacles]
-        self._sizes = [_measure_work(part, meshes) for part in parts]
-        self._began = self._shown = time.perf_counter()
-
-    def follow(self, parts: Iterable[T]) -> Iterator[T]:
-        """Yield the home's objects, or then its obstacles, which have a `name`, and count them."""
-        for part in parts:
-            now = time.perf_counter()
-            if now - self._shown > _PATIENCE and self.done:
-                self._shown = now
-                done, left = sum(self._sizes[: self.done]), sum(self._sizes[self.done :])
-                seconds = (now - self._began) / done * left
-                about = f"part {self.done + 1} of {len(self._sizes)}, about {seconds:.0f} s left"
-                _LOGGER.info("%s: %s", getattr(part, "name", ""), about)
-            yield part
-            self.done += 1
-
-
-def _measure_work(part: HomeObject | Link, meshes: set[tuple[Path, tuple[float, ...]]]) -> float:
-    """Return about the number of triangles of a part's new meshes, and `_PART_WORK`.
-
-    Args:
-        part: The part.
-        meshes: Files and scales of meshes that count already, to which those of the part are added.
-    """
-    links = part.description.links.values() if isinstance(part, HomeObject) else (part,)
-    work = _PART_WORK
-    for solid in (solid for link in links for solid in link.solid):
-        if solid.triangles is not None:
-            work += len(solid.triangles.faces)
-        elif solid.file is not None and (solid.file, solid.size) not in meshes:
-            meshes.add((solid.file, solid.size))
-            work += solid.file.stat().st_size / _TRIANGLE_SIZE
+def measure_parts(home: Home) -> list[float]:
+    """Return the work of a home's objects, and then of its obstacles, for `ImportProgress`."""
+    meshes = MeshKeys()
+    work = [measure_links(item.description.links.values(), meshes) for item in home.objects]
+    work += [measure_links([link], meshes) for _, link in _iterate_obstacle_links(home)]
     return work
 
 

@@ -29,12 +29,13 @@ from vkc_pin.importing.objects.clean_up import (
 from vkc_pin.importing.objects.description import WEIGHTLESS, Description
 from vkc_pin.importing.objects.limits import add_missing_limits
 from vkc_pin.importing.objects.mjcf import read_object_mjcf
-from vkc_pin.importing.objects.pieces import decompose_links
+from vkc_pin.importing.objects.pieces import PLACES_WORK, decompose_links, measure_links
 from vkc_pin.importing.objects.sdf import read_object_sdf
 from vkc_pin.importing.objects.urdf import read_object_urdf
 from vkc_pin.importing.objects.writing import write_description, write_urdf
 from vkc_pin.importing.parsers import expand_xacro, uses_xacro
 from vkc_pin.importing.pictures import plot_attachments
+from vkc_pin.importing.progress import ImportProgress
 from vkc_pin.importing.proposals.proposal import Proposals
 from vkc_pin.importing.proposals.propose import propose_attachments
 from vkc_pin.importing.scenes import locate_robot, make_object_scene, refer_to_robot, write_scene
@@ -180,7 +181,8 @@ def import_object(  # noqa: PLR0913 - keyword options of a public call
 
     Its shapes become convex pieces, fixed links are merged with their masses, and missing limits
     chosen. The origin is below the centre, at the height of the lowest point.
-    Attachments are proposed for every joint.
+    Attachments are proposed for every joint. Long imports log their progress to
+    `vkc_pin.importing`.
 
     Args:
         file: The file.
@@ -235,7 +237,9 @@ def import_object(  # noqa: PLR0913 - keyword options of a public call
     description = _place_on_floor(description)
     if description.is_massless:
         description = dataclasses.replace(description, notes=(*description.notes, WEIGHTLESS))
-    description = decompose_links(description, load_surfaces(description))
+    work = [measure_links([link], set()) for link in description.links.values()]
+    progress = ImportProgress([*work, PLACES_WORK * len(description.joints)])
+    description = decompose_links(description, load_surfaces(description), progress=progress)
     description = add_missing_limits(description)
     # `check_target` allowed replacing it
     with write_folder_atomically(target, force=True, source=path) as staging:
@@ -250,6 +254,7 @@ def import_object(  # noqa: PLR0913 - keyword options of a public call
             about.append(f"Name of the link: {link}")
         springs = description.joints.values()
         write_description(yaml, urdf.name, (), about=about, joints=springs)
+        progress.begin("attachments")
         proposals = propose_attachments(load_object(yaml), robot, most=most, **clearances)
         about.append(f"Attachments as proposed for the hand of {proposals.hand.robot}, best first.")
         about += [

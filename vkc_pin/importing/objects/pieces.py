@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,32 +13,68 @@ import pinocchio as pin
 from vkc_pin.importing.convex import ERROR, Pieces, decompose, is_flat, measure_outside
 from vkc_pin.importing.objects.clean_up import Surfaces
 from vkc_pin.importing.objects.description import Description, Link, Part
+from vkc_pin.importing.progress import ImportProgress
 from vkc_pin.world.files.hulls import SHEET_THICKNESS
 
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["PieceCache", "decompose_links"]
+__all__ = ["PLACES_WORK", "MeshKeys", "PieceCache", "decompose_links", "measure_links"]
 
 # [m] Largest protrusion of pieces of moving links, about a finger's clearance from a handle
 _FINE = 0.006
 _INSIDE = 1e-3  # [m] largest protrusion of a piece that counts as inside another
-
+_TRIANGLE_SIZE = 50.0  # [bytes] of a triangle in a binary STL file; text takes up to twice as much
 
 PieceCache = dict[tuple[Path | None, tuple[float, ...], float], Pieces]
 """Cache of the pieces of mesh files, in the mesh's frame, by file, scale and error [m]."""
 
+PLACES_WORK = 2000.0
+"""Triangles that take as long to cut as places for hands on a part are sought."""
+
+MeshKeys = set[tuple[Path, tuple[float, ...]]]
+"""Files and scales of meshes, which are cut once."""
+
+
+def measure_links(links: Iterable[Link], meshes: MeshKeys) -> float:
+    """Return about the number of triangles of the links' new meshes, and `PLACES_WORK`.
+
+    Args:
+        links: The links of a part.
+        meshes: Meshes that count already, to which those of the links are added.
+    """
+    work = PLACES_WORK
+    for link in links:
+        for solid in link.solid:
+            if solid.triangles is not None:
+                work += len(solid.triangles.faces)
+            elif solid.file is not None and (solid.file, solid.size) not in meshes:
+                meshes.add((solid.file, solid.size))
+                work += solid.file.stat().st_size / _TRIANGLE_SIZE
+    return work
+
 
 def decompose_links(
-    description: Description, meshes: Surfaces, cache: PieceCache | None = None
+    description: Description,
+    meshes: Surfaces,
+    cache: PieceCache | None = None,
+    progress: ImportProgress | None = None,
 ) -> Description:
     """Return the object with convex collision geometry only.
 
     Notes name flat shapes, pieces that protrude far, and links that collide with their visual
     shapes.
+
+    Args:
+        description: The object.
+        meshes: Surfaces of its parts.
+        cache: Pieces of mesh files that are known, to which new ones are added.
+        progress: Progress of an import, whose next parts are the links.
     """
     notes, links = list(description.notes), dict[str, Link]()
-    for name, link in description.links.items():
+    parts = description.links.values()
+    for link in parts if progress is None else progress.follow(parts):
+        name = link.name
         error = _FINE if name in description.joints else ERROR
         solids, flat_parts = list[Part](), list[str]()
         for part in link.solid:

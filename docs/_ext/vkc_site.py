@@ -10,6 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import api_pages
+
+# Under autodoc, which sets TYPE_CHECKING, its first import would end half way.
+import pydantic  # noqa: F401
 from docutils import nodes
 from sphinx import addnodes
 from sphinx.application import Sphinx

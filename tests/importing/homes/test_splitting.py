@@ -2,7 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from helpers.descriptions import make_description, make_joint, make_part
+import trimesh
+from helpers.descriptions import make_description, make_joint, make_mesh_part, make_part
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -157,3 +158,39 @@ def test_floor_surrounds_a_home_without_building() -> None:
     )
     low, high = add_floor(home, np.zeros(3), np.ones(3))
     assert (low.tolist(), high.tolist()) == ([-2.0, -2.0, 0.0], [3.0, 3.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("boxes", "open_sides"),
+    [
+        ([((0.8, 0.6, 0.7), (2.0, 0.0, 0.35))], "nswe"),  # a table
+        ([((0.3, 0.3, 2.0), (0.0, 0.0, 1.0))], "nswe"),  # a column
+        ([((4.0, 0.1, 2.4), (0.0, 0.0, 1.2))], "nswe"),  # a wall without a room
+        ([((4.0, 3.0, 0.9), (0.0, 0.0, 0.45))], "nswe"),  # a platform
+        # a row of shelves along the whole home, and a wall opposite to it
+        ([((6.0, 0.8, 2.0), (0.0, 0.4, 1.0)), ((6.0, 0.1, 2.0), (0.0, 3.0, 1.0))], "swe"),
+    ],
+)
+def test_solids_are_no_walls(
+    boxes: list[tuple[tuple[float, ...], tuple[float, ...]]], open_sides: str
+) -> None:
+    """Floor lies around what fills the home from side to side."""
+    parts = tuple(make_part("box", size, at) for size, at in boxes)
+    corners = np.vstack([part.make_mesh().bounds for part in parts])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    home = split([Link("rooms", (), parts), make_link("lid")], connect("rooms", "lid"))
+    wider_low, wider_high = add_floor(home, low, high)
+    beyond = {side: 2.0 * (side in open_sides) for side in "nswe"}
+    assert low - wider_low == pytest.approx([beyond["w"], beyond["s"], 0.0])
+    assert wider_high - high == pytest.approx([beyond["e"], beyond["n"], 0.0])
+
+
+def test_walls_without_thickness_are_walls() -> None:
+    """Rooms of other programs are drawn from the inside, the outside or both."""
+    corners = np.array([[x, y, z] for z in (0.0, 2.4) for x in (-3.0, 3.0) for y in (-2.0, 2.0)])
+    for faces in ([[0, 2, 6], [0, 6, 4]], [[0, 6, 2], [0, 4, 6]]):  # the south alone
+        part = make_mesh_part(trimesh.Trimesh(corners, faces, process=False))
+        home = split([Link("rooms", (), (part,)), make_link("lid")], connect("rooms", "lid"))
+        low, high = add_floor(home, np.array([-3.0, -2.0, 0.0]), np.array([3.0, 2.0, 2.4]))
+        assert low == pytest.approx([-5.0, -2.0, 0.0])
+        assert high == pytest.approx([5.0, 4.0, 2.4])

@@ -141,7 +141,8 @@ def split_home(description: Description) -> Home:
 def add_floor(home: Home, low: Floats, high: Floats) -> tuple[Floats, Floats]:
     """Return a box around a home with 2 m of floor beyond the sides without walls.
 
-    A side has walls if those of the building cover at least half of its length.
+    A side has walls if those of the building cover at least half of its length. A wall is near the
+    side and faces the inside: a solid that fills the home from side to side is none.
 
     Args:
         home: The home.
@@ -151,16 +152,21 @@ def add_floor(home: Home, low: Floats, high: Floats) -> tuple[Floats, Floats]:
     from trimesh.intersections import mesh_plane
 
     up, origin = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, _WALL_HEIGHT])
-    sections = [
-        np.asarray(mesh_plane(part.make_mesh(), up, origin)).reshape(-1, 2, 3)
-        for link in home.building
-        for part in link.solid
-    ]
-    lines = np.concatenate([np.zeros((0, 2, 3)), *sections])
+    sections, normals = [np.zeros((0, 2, 3))], [np.zeros((0, 3))]
+    for part in (part for link in home.building for part in link.solid):
+        mesh = part.make_mesh()
+        cut, faces = mesh_plane(mesh, up, origin, return_faces=True)
+        sections.append(np.asarray(cut).reshape(-1, 2, 3))
+        # An open surface is a wall of both sides.
+        normals.append(mesh.face_normals[faces] if mesh.is_watertight else np.zeros((len(cut), 3)))
+    lines, outward = np.concatenate(sections), np.concatenate(normals)
     beyond = np.zeros((2, 3))
     for axis, side in itertools.product((0, 1), (0, 1)):
+        depth = min(_WALL_DEPTH, 0.5 * float((high - low)[axis]))
         distance = np.abs(lines[:, :, axis] - (low, high)[side][axis]).max(axis=1)
-        along = np.sort(lines[distance < _WALL_DEPTH][:, :, 1 - axis], axis=1)
+        inward = (1.0, -1.0)[side] * outward[:, axis] >= 0.0
+        is_wall = inward & (distance < depth)
+        along = np.sort(lines[is_wall][:, :, 1 - axis], axis=1)
         covered, reached = 0.0, -np.inf
         for start, end in sorted(map(tuple, along)):
             covered += max(0.0, end - max(start, reached))

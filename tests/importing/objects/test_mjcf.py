@@ -100,3 +100,22 @@ def test_springs_and_limits_are_relative_to_the_pose_in_the_file(
     assert read.limits == (None if limits is None else pytest.approx(np.radians(limits)))
     assert (read.stiffness, np.degrees(read.springref)) == pytest.approx(spring)
     assert ("`ref`" in " ".join(found.notes)) == (" ref=" in joint)
+
+
+WEDGE = '<mesh name="wedge" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/>'
+
+
+@pytest.mark.parametrize("name", ["", 'name="hills"'])
+@pytest.mark.parametrize("mesh", ["", WEDGE])
+def test_height_fields_are_left_out(tmp_path: Path, mesh: str, name: str) -> None:
+    field = '<hfield name="h" nrow="2" ncol="2" size="1 1 .3 .1" elevation="0 0 1 0"/>'
+    shape = '<geom type="mesh" mesh="wedge"/>' if mesh else '<geom name="wedge" size="1"/>'
+    (tmp_path / "t.xml").write_text(
+        f"<mujoco><asset>{mesh}{field}</asset><worldbody>"
+        f'<geom {name} type="hfield" hfield="h"/><body name="b">{shape}</body>'
+        "</worldbody></mujoco>"
+    )
+    found = read_object_mjcf(tmp_path / "t.xml")
+    assert [part.name for link in found.links.values() for part in link.solid] == ["wedge"]
+    title = "hills" if name else ""
+    assert found.notes == (f"geom '{title}' of body 'world' is a height field: left out",)

@@ -181,7 +181,9 @@ class _Reader:
             name = self._find_name("geom", geom, default=self._find_mesh_name(geom))
             if shape is None:
                 subject = f"geom '{name}' of body '{self.bodies[body]}'"
-                self.notes.append(f"{subject} has no volume (a plane): left out")
+                is_field = kind == int(kinds.mjGEOM_HFIELD)
+                why = "is a height field" if is_field else "has no volume (a plane)"
+                self.notes.append(f"{subject} {why}: left out")
                 continue
             part = Part(
                 name=name,
@@ -212,7 +214,9 @@ class _Reader:
 
     def _find_mesh_name(self, geom: int) -> str:
         number = int(self.model.geom_dataid[geom])
-        return self._find_name("mesh", number) if number >= 0 else ""
+        # That of a height field is a number of height fields.
+        is_mesh = int(self.model.geom_type[geom]) == int(self.mujoco.mjtGeom.mjGEOM_MESH)
+        return self._find_name("mesh", number) if is_mesh else ""
 
     def _add_name(self, name: str) -> str:
         """Return a name for a link without one: `name`, with "_" appended while it is taken."""

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib.metadata import files
 from pathlib import Path
+from urllib.parse import quote
 
 import numpy as np
 import pytest
@@ -615,6 +616,8 @@ def test_y_is_up_in_gltf_files(tmp_path: Path, name: str) -> None:
         ({"nodes": [{"mesh": 0, "extensions": {"EXT_mesh_gpu_instancing": {}}}]}, "instancing"),
         ({"mode": 6}, "mode 6"),
         ({"normalized": True}, "normalized positions"),
+        ({"sparse": "POSITION"}, "sparse accessor"),
+        ({"sparse": "indices"}, "sparse accessor"),
     ],
 )
 def test_surfaces_of_gltf_files_that_cannot_be_read_raise(
@@ -626,8 +629,55 @@ def test_surfaces_of_gltf_files_that_cannot_be_read_raise(
     gltf.document |= {"meshes": [{"primitives": [primitive]}], "nodes": [{"mesh": 0}]}
     if "normalized" in change:
         gltf.document["accessors"][0]["normalized"] = True
+    if "sparse" in change:
+        number = {**primitive["attributes"], **primitive}[change["sparse"]]
+        indices = {"bufferView": 1, "componentType": 5123}
+        values = {"bufferView": 0}
+        gltf.document["accessors"][number]["sparse"] = {
+            "count": 1,
+            "indices": indices,
+            "values": values,
+        }
     gltf.document |= {key: value for key, value in change.items() if key in ("nodes",)}
     gltf.document |= {k: value for k, value in change.items() if k == "extensionsRequired"}
     file = gltf.write(tmp_path / "box.glb", [0])
     with expect_error(problem, file=file):
         load_mesh(file)
+
+
+@pytest.mark.parametrize("name", ["my box.bin", "box+1.bin", "100%.bin", "schön.bin"])
+def test_buffers_of_gltf_files_are_named_by_uris(tmp_path: Path, name: str) -> None:
+    gltf = Gltf()
+    primitive = gltf.add_primitive(BOX, np.array(BOX_TRIANGLES))
+    gltf.document |= {"meshes": [{"primitives": [primitive]}], "nodes": [{"mesh": 0}]}
+    file = gltf.write(tmp_path / "box.gltf", [0])
+    document = json.loads(file.read_text())
+    (tmp_path / name).write_bytes(gltf.data)
+    for uri in (name, quote(name)):
+        document["buffers"][0]["uri"] = uri
+        file.write_text(json.dumps(document))
+        np.testing.assert_allclose(load_mesh(file).extents, [3, 1, 2])
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("\nf", " # corner\nf"),
+        ("\nf", "\t#corner\nf"),
+        ("\nf", " # f 1 2 3\n# f 1 2 3\nf"),
+        ("v 3", "v 3.0e0"),
+        (" 0\n", " 0 # on the floor\n"),
+        ("v 0 0 0", "v -0.0E+00 0 0. #"),
+    ],
+)
+def test_comments_of_obj_files_are_left_out(tmp_path: Path, old: str, new: str) -> None:
+    """Neither trimesh nor assimp reads those behind faces."""
+    lines = [f"v {x:g} {y:g} {z:g}" for x, y, z in BOX]
+    lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in BOX_TRIANGLES]
+    text = "\n".join(lines) + "\n"
+    assert old in text
+    file = tmp_path / "box.obj"
+    file.write_text(text.replace(old, new))
+    mesh = load_mesh(file)
+    np.testing.assert_allclose(mesh.bounds, [[0, 0, 0], [3, 2, 1]])
+    assert mesh.volume == pytest.approx(6.0)

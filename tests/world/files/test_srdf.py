@@ -163,11 +163,12 @@ def test_home_states_are_preferred(tmp_path: Path, names: list[str], chosen: str
 
 
 def test_states_of_disjoint_groups_are_merged(tmp_path: Path) -> None:
-    """Joints with several coordinates are skipped."""
+    """Joints with several coordinates, and values that are no numbers, are skipped."""
     srdf = read_text(
         tmp_path,
         format_state("home", "a", arm="0.5")
         + format_state("up", "a", arm="-1e-1", fore="1 0 0")
+        + format_state("odd", "a", arm="nan", lift="inf")
         + format_state("home", "b", lift="2"),
     )
     both = ["j_arm", "j_lift"]

@@ -32,8 +32,8 @@ _COPIES = "EXT_mesh_gpu_instancing"  # places a node's mesh many times
 def check_gltf(file: Path) -> None:
     """Raise an `InputError` if a glTF file holds surfaces that trimesh would leave out or misplace.
 
-    These are triangle fans, normalized positions, instances on the graphics card, and extensions
-    that the file requires. Invalid files are left to trimesh.
+    These are triangle fans, normalized positions, sparse accessors, instances on the graphics card,
+    and extensions that the file requires. Invalid files are left to trimesh.
     """
     document = _read_document(file)
     required = _get_list(document, "extensionsRequired")
@@ -55,10 +55,15 @@ def check_gltf(file: Path) -> None:
             if primitive.get("mode", 4) == _TRIANGLE_FAN or primitive.get("mode", 4) not in _MODES:
                 got = f"{mesh.get('name', 'a mesh')}: mode {primitive['mode']}"
                 raise _make_error(file, "this kind of primitive", got)
-            number: Any = (primitive.get("attributes") or {}).get("POSITION")
-            is_valid = isinstance(number, int) and 0 <= number < len(accessors)
-            if is_valid and accessors[number].get("normalized"):
-                raise _make_error(file, "normalized positions", mesh.get("name", "a mesh"))
+            positions: Any = (primitive.get("attributes") or {}).get("POSITION")
+            name = mesh.get("name", "a mesh")
+            indices: Any = primitive.get("indices")
+            for number in (positions, indices):
+                is_valid = isinstance(number, int) and 0 <= number < len(accessors)
+                if is_valid and accessors[number].get("normalized"):
+                    raise _make_error(file, "normalized positions", name)
+                if is_valid and accessors[number].get("sparse"):
+                    raise _make_error(file, "a sparse accessor", name)
 
 
 def _read_document(file: Path) -> Any:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote
 
 import coal
 import numpy as np
@@ -204,13 +205,19 @@ def _open_mesh(file: Path, submesh: str | None = None) -> tuple[Path | io.BytesI
 
 
 def _make_resolver(file: Path) -> Any:
-    """Return trimesh's reader of materials and buffers that a mesh names, without pipes."""
+    """Return trimesh's reader of materials and buffers that a mesh names, without pipes.
+
+    glTF files name them by URIs, whose reserved characters are escaped.
+    """
     import trimesh
 
     resolver: Any = trimesh.resolvers.FilePathResolver(str(file))
+    is_gltf = file.suffix.lower() in GLTF_SUFFIXES
     read = resolver.get
 
     def get(name: str) -> bytes:
+        if is_gltf and not (file.parent / name).exists():
+            name = unquote(name)
         for place in (file.parent / name.strip(), file.parent / Path(name).name):
             if place.exists() and not place.is_file():
                 raise FileNotFoundError(f"{place} is not a regular file")  # it may be endless

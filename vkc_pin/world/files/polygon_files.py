@@ -21,6 +21,8 @@ __all__ = ["divide_polygons", "is_plain_obj", "normalize_obj", "read_off"]
 
 # Faces of OBJ files whose corners count from the end, or from 0
 _NOT_FROM_ONE = re.compile(rb"\nf[^\n]*[ /][-0]")
+# Comments behind the numbers of a line
+_COMMENTED = re.compile(rb"\n(?:v|vt|vn|f)[ \t][^\n#]*#")
 _POLYGON = re.compile(rb"\nf(?: +[0-9/]+){4}")  # a face with more than three corners
 _OFF_HEADER = re.compile(r"\s*(?:ST)?C?N?OFF\b")
 
@@ -33,6 +35,7 @@ def is_plain_obj(data: bytes) -> bool:
         and data.count(b"\r") == data.count(b"\r\n")
         and not _NOT_FROM_ONE.search(data)
         and not _POLYGON.search(data)
+        and not _COMMENTED.search(b"\n" + data)
     )
 
 
@@ -54,6 +57,8 @@ def normalize_obj(data: bytes, file: Path, submesh: str | None) -> bytes:
     is_kept = is_found = wanted is None
     for number, line in enumerate(data.removeprefix(codecs.BOM_UTF8).split(b"\n"), 1):
         key, *values = line.split() or [b""]
+        if key in (*counts, b"f"):
+            values = line.partition(b"#")[0].split()[1:]
         if key in counts:
             counts[key] += 1
             if key == b"v":
@@ -66,8 +71,7 @@ def normalize_obj(data: bytes, file: Path, submesh: str | None) -> bytes:
             if not is_kept:
                 continue
             is_found = True
-            corners = line.partition(b"#")[0].split()[1:]
-            values = [_count_from_start(corner, counts, file, number) for corner in corners]
+            values = [_count_from_start(corner, counts, file, number) for corner in values]
             if len(values) > 3:
                 polygons[len(lines)] = values
         lines.append(b" ".join([key, *values]))

@@ -6,6 +6,7 @@ that name unknown links, joints or groups are skipped, one by one, and noted.
 
 from __future__ import annotations
 
+import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -347,9 +348,11 @@ def _read_states(
                 unknown[name] = None
                 continue
             try:
-                positions[name] = float(joint.get("value", ""))
+                position = float(joint.get("value", ""))
             except ValueError:
                 continue  # joints of several coordinates: not ours
+            if math.isfinite(position):
+                positions[name] = position
         name, group = (element.get(key, "").strip() for key in ("name", "group"))
         states.append(SrdfState(name, group, positions))
     return tuple(states), unknown

@@ -275,9 +275,91 @@ def test_inertia_resistance_and_springs_are_read(tmp_path: Path) -> None:
     joint = found.joints["front"]
     read = (joint.damping, joint.friction, joint.stiffness, joint.springref)
     assert read == tuple(settings.values())
-    partial = read_chest(tmp_path, front=inertial.replace(moments, ""))
-    assert partial.links["front"].inertia.mass == 0.0
-    assert any("<inertial> counts as none" in note for note in partial.notes)
+    wrong = read_chest(tmp_path, front=inertial.replace("0.1</ixx>", "-0.1</ixx>"))
+    assert wrong.links["front"].inertia.mass == 0.0
+    assert any("<inertial> counts as none" in note for note in wrong.notes)
+
+
+BOXES = (
+    '<collision name="{0}"><pose>0 0 {1} 0 0 0</pose>{2}'
+    "<geometry><box><size>0.1 0.2 0.3</size></box></geometry></collision>"
+)
+BALL = (
+    '<collision name="ball"><pose>0.2 0 0 0 0 0</pose>'
+    "<geometry><sphere><radius>0.1</radius></sphere></geometry></collision>"
+)
+BOX_SIZE = (0.1, 0.2, 0.3)
+BALL_MASS = 4000.0 / 3.0 * np.pi * 0.1**3
+
+
+def place(inertia: pin.Inertia, *at: float) -> pin.Inertia:
+    return pin.SE3(np.eye(3), np.array(at)).act(inertia)
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        ("<inertial><mass>2</mass></inertial>", pin.Inertia(2.0, np.zeros(3), np.eye(3))),
+        ("<inertial/>", pin.Inertia(1.0, np.zeros(3), np.eye(3))),
+        (
+            "<inertial><pose>0 0.1 0 0 0 0</pose><mass>3</mass>"
+            "<inertia><ixx>0.5</ixx><iyz>0.1</iyz></inertia></inertial>",
+            pin.Inertia(
+                3.0,
+                np.array([0.0, 0.1, 0.0]),
+                np.array([[0.5, 0.0, 0.0], [0.0, 1.0, 0.1], [0.0, 0.1, 1.0]]),
+            ),
+        ),
+        (
+            '<inertial auto="true"/>' + BOXES.format("b", 0.5, ""),
+            place(pin.Inertia.FromBox(6.0, *BOX_SIZE), 0.0, 0.0, 0.5),
+        ),
+        (
+            '<inertial auto="1"><density>200</density></inertial>'
+            + BOXES.format("b", 0.5, "")
+            + BOXES.format("c", 1.0, "<density>20000</density>"),
+            place(pin.Inertia.FromBox(1.2, *BOX_SIZE), 0.0, 0.0, 0.5)
+            + place(pin.Inertia.FromBox(120.0, *BOX_SIZE), 0.0, 0.0, 1.0),
+        ),
+        (
+            '<inertial auto="true"><mass>5</mass><inertia><ixx>9</ixx></inertia></inertial>'
+            + BOXES.format("b", 0.5, "<density>7</density>"),
+            place(pin.Inertia.FromBox(5.0, *BOX_SIZE), 0.0, 0.0, 0.5),
+        ),
+        (
+            '<inertial auto="true"/>' + BALL,
+            place(pin.Inertia.FromSphere(BALL_MASS, 0.1), 0.2, 0.0, 0.0),
+        ),
+    ],
+)
+def test_inertia_that_is_not_stated_is_that_of_gazebo(
+    tmp_path: Path, content: str, expected: pin.Inertia
+) -> None:
+    text = f'<sdf version="1.11"><model name="m"><link name="l">{content}</link></model></sdf>'
+    found = read_model(tmp_path, text).links["l"].inertia
+    assert found.isApprox(expected, 1e-6)
+
+
+def test_mass_of_imported_drawer_is_computed_from_its_mesh(tmp_path: Path) -> None:
+    """The mesh is an L of two boxes, scaled from millimetres."""
+    parts = [trimesh.creation.box((400, 100, 100)), trimesh.creation.box((100, 300, 100))]
+    parts[1].apply_translation((-150, 200, 0))
+    trimesh.util.concatenate(parts).export(tmp_path / "l.stl")
+    shape = "<mesh><uri>l.stl</uri><scale>0.001 0.001 0.001</scale></mesh>"
+    front = f'<collision name="l"><geometry>{shape}</geometry></collision>'
+    found = read_chest(tmp_path, front=f'<inertial auto="true"/>{front}', version="1.11")
+    inertia = found.links["front"].inertia
+    box_mass = sum(
+        1000.0 * np.prod(part.size) for part in found.links["front"].collision if part.kind == "box"
+    )
+    assert inertia.mass == pytest.approx(7.0 + box_mass)
+
+
+def test_inertia_without_solids_counts_as_none(tmp_path: Path) -> None:
+    link = '<link name="l"><inertial auto="true"/></link>'
+    found = read_model(tmp_path, f'<sdf version="1.11"><model name="m">{link}</model></sdf>')
+    assert found.links["l"].inertia.mass == 0.0
+    assert any("cannot be computed from its collision shapes" in note for note in found.notes)
 
 
 @pytest.mark.parametrize(

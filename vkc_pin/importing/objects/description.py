@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import coal
 import numpy as np
 import pinocchio as pin
 
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     import trimesh
 
 __all__ = [
+    "SOLIDS",
     "WEIGHTLESS",
     "Colour",
     "Description",
@@ -36,6 +38,13 @@ WEIGHTLESS = (
 )
 _RESISTANCES = ("damping", "friction", "stiffness")
 _SIDES = 48  # facets of a cylinder mesh
+SOLIDS = {
+    "box": coal.Box,
+    "sphere": coal.Sphere,
+    "cylinder": coal.Cylinder,
+    "capsule": coal.Capsule,
+}
+"""Constructors of primitive shapes, whose arguments are the sizes of a `Part`."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -79,6 +88,19 @@ class Part:
         else:
             mesh = trimesh.creation.cylinder(self.size[0], height=self.size[1], sections=_SIDES)
         return mesh.apply_transform(self.placement.homogeneous)
+
+    def compute_inertia(self, density: float) -> pin.Inertia:
+        """Return the inertia of a solid of this `density` [kg/m³] in the frame of its link."""
+        if self.kind in SOLIDS:
+            solid = SOLIDS[self.kind](*self.size)
+            mass = density * solid.computeVolume()
+            tensor = density * np.asarray(solid.computeMomentofInertia())
+            return self.placement.act(pin.Inertia(mass, np.zeros(3), tensor))
+        mesh = self.make_mesh()
+        mesh.density = density
+        return pin.Inertia(
+            float(mesh.mass), np.asarray(mesh.center_mass), np.asarray(mesh.moment_inertia)
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ import pinocchio as pin
 
 from vkc_pin.importing.convex import ERROR
 from vkc_pin.importing.objects.clean_up import compute_bounds, load_surfaces, place_vertices
-from vkc_pin.importing.objects.description import Description, Joint
+from vkc_pin.importing.objects.description import SOLIDS, Description, Joint
 from vkc_pin.world.files.meshes import make_convex_hull
 from vkc_pin.world.models.shapes import compute_shape_distance, compute_world_box
 
@@ -24,13 +24,6 @@ _STEPS = 18  # checked positions of the travel: every 5° of a right angle
 # [m] by which parts may overlap more than when they are closed: convex pieces protrude as much
 _TOUCH = ERROR
 _LEAST = 0.1  # of the travel: if parts meet before it in all directions, they do not tell where to
-
-_SOLIDS = {
-    "box": coal.Box,
-    "sphere": coal.Sphere,
-    "cylinder": coal.Cylinder,
-    "capsule": coal.Capsule,
-}
 
 
 def add_missing_limits(description: Description) -> Description:
@@ -91,7 +84,7 @@ class _Chooser:
                     vertices = self._surfaces[id(part)].vertices
                     yield name, make_convex_hull(vertices, about=name), self._placements[name]
                 else:
-                    solid = _SOLIDS[part.kind](*part.size)
+                    solid = SOLIDS[part.kind](*part.size)
                     yield name, solid, self._placements[name] * part.placement
 
     def choose(self, child: str, ends: tuple[float, float]) -> tuple[tuple[float, float], str]:

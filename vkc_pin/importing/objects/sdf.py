@@ -6,7 +6,7 @@ import math
 import re
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,11 @@ __all__ = ["read_object_sdf"]
 
 _NEWEST = 12  # minor version
 _MOST_MODELS = 5000
+# Of an <inertial> that does not state them, by the specification
+_MASS = 1.0  # [kg]
+_MOMENT = 1.0  # [kg·m²] about each axis
+_DENSITY = 1000.0  # [kg/m³] of a shape whose inertia is computed
+_DIAGONAL = ("ixx", "iyy", "izz")
 _MOVING = ("revolute", "continuous", "prismatic")
 _JOINT_TYPES = ("fixed", *_MOVING, "ball", "universal", "revolute2", "screw", "gearbox")
 # Numbers of each shape: name of the element and count
@@ -476,6 +481,7 @@ class _Reader:
             tuple(self._read_shapes(scope, element, kind, base, local, errors))
             for kind, errors in lost.items()
         )
+        inertia = self._read_inertia(scope, element, base, local, collision)
         if lost["collision"] and visual:
             collision, about = (), "its visual shapes collide instead"
             self.notes += [f"link '{local}': {error}: {about}" for error in lost["collision"]]
@@ -483,7 +489,7 @@ class _Reader:
             lost_kind = "collision" if lost["collision"] else "visual"
             self.missing += [MissingMesh(name, lost_kind, error) for error in lost[lost_kind]]
         self.notes += [f"link '{local}': {error}: left out" for error in lost["visual"]]
-        return Link(name, visual, collision, self._read_inertia(scope, element, base, local))
+        return Link(name, visual, collision, inertia)
 
     def _read_shapes(
         self,
@@ -551,22 +557,72 @@ class _Reader:
         return {"kind": shape.tag, "size": size}
 
     def _read_inertia(
-        self, scope: Scope, link: ElementTree.Element, base: pin.SE3, local: str
+        self,
+        scope: Scope,
+        link: ElementTree.Element,
+        base: pin.SE3,
+        local: str,
+        collision: Sequence[Part],
     ) -> pin.Inertia:
-        """Return a link's inertia; an incomplete <inertial> counts as none, with a note."""
+        """Return a link's inertia; a wrong <inertial> counts as none, with a note.
+
+        Values that an <inertial> leaves out have the defaults of the specification.
+        """
         element = link.find("inertial")
         if element is None:
             return pin.Inertia.Zero()
-        moments = element.find("inertia")
         try:
-            if element.find("mass") is None or moments is None:
-                raise InputError("an <inertial> needs both <mass> and <inertia>", field=local)
-            (mass,) = scope.read_numbers(element, "mass", 1, None, local)
-            entries = (scope.read_numbers(moments, key, 1, "0", local)[0] for key in MOMENTS)
-            return make_inertia(mass, entries, base * scope.read_pose(element, local))
+            if is_true(element.get("auto", "")):
+                return self._compute_inertia(scope, link, element, local, collision)
+            (mass,) = scope.read_numbers(element, "mass", 1, f"{_MASS}", local)
+            moments = element.find("inertia")
+            if moments is None:
+                moments = ElementTree.Element("inertia")
+                stated = f"states no <inertia>: {_MOMENT:g} kg·m² about each axis, as in Gazebo"
+                self.notes.append(f"link '{local}': its <inertial> {stated}")
+            entries = [
+                scope.read_numbers(moments, key, 1, f"{_MOMENT if key in _DIAGONAL else 0}", local)
+                for key in MOMENTS
+            ]
+            values = (value for (value,) in entries)
+            return make_inertia(mass, values, base * scope.read_pose(element, local))
         except InputError as error:
             self.notes.append(f"link '{local}': {error}: its <inertial> counts as none")
             return pin.Inertia.Zero()
+
+    def _compute_inertia(
+        self,
+        scope: Scope,
+        link: ElementTree.Element,
+        inertial: ElementTree.Element,
+        local: str,
+        collision: Sequence[Part],
+    ) -> pin.Inertia:
+        """Return the inertia of a link's collision shapes as solids, with the mass it states.
+
+        A shape has its own density, else that of the <inertial>, else that of water, as in
+        libsdformat, which scales the sum to a stated mass from its version 15.2 on.
+        """
+        (common,) = scope.read_numbers(
+            inertial, "density", 1, f"{_DENSITY}", local, largest=math.inf
+        )
+        densities = dict[str, float]()
+        for element in link.findall("collision"):
+            (density,) = scope.read_numbers(
+                element, "density", 1, f"{common!r}", local, largest=math.inf
+            )
+            densities[element.get("name", "")] = density
+        total = pin.Inertia.Zero()
+        for part in collision:
+            total += part.compute_inertia(densities[part.name])
+        if not total.mass > 0.0:
+            problem = "its mass cannot be computed from its collision shapes"
+            raise InputError(problem, field=local, expected="solids", got=f"{total.mass:g} kg")
+        if inertial.find("mass") is not None:
+            (mass,) = scope.read_numbers(inertial, "mass", 1, None, local)
+            tensor = np.asarray(total.inertia) * mass / total.mass
+            total = pin.Inertia(mass, total.lever, tensor)
+        return total
 
     def _read_colour(
         self, scope: Scope, element: ElementTree.Element, name: str

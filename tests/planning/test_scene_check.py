@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 
@@ -132,6 +133,17 @@ def test_planning_continues_from_the_end_scene() -> None:
         failed.end_scene()
 
 
+def load_cup_scene(attachment: str) -> Scene:
+    """Return a scene with a cup that has a single attachment."""
+    scene = vkc.load_scene("tray")
+    (cup,) = (one for one in scene.document["objects"] if one["name"] == "cup")
+    alone = replace_scene_fields(scene, objects=[cup])
+    placed = alone.objects["cup"]
+    kept = {attachment: placed.object.attachments[attachment]}
+    only = dataclasses.replace(placed.object, attachments=kept)
+    return dataclasses.replace(alone, objects={"cup": dataclasses.replace(placed, object=only)})
+
+
 @pytest.mark.parametrize(
     ("attachment", "required", "is_reached"),
     [
@@ -150,12 +162,8 @@ def test_check_and_plan_demand_the_same_clearance(
     attachment: str, required: float, is_reached: bool
 ) -> None:
     """A clearance that falls short by up to 1 mm is accepted by both, and by neither beyond."""
-    scene, options = vkc.load_scene("tray"), vkc.Options(grasp_clearance=required)
-    one = next(
-        one
-        for one in check_scene(scene, options=options).attachments
-        if (one.object, one.attachment) == ("cup", attachment)
-    )
+    scene, options = load_cup_scene(attachment), vkc.Options(grasp_clearance=required)
+    (one,) = check_scene(scene, options=options).attachments
     plan = vkc.plan(scene, [vkc.Grasp("cup", attachment)], options=options)
     assert plan.success == is_reached
     assert (one.configuration is not None) == is_reached

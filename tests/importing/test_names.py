@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -87,7 +88,7 @@ def test_links_of_a_robot_keep_their_names(tmp_path: Path) -> None:
     ("import_file", "name", "description"),
     [
         (vkc.importing.import_object, "cabinet.urdf", "[!s]*.yaml"),
-        (vkc.importing.import_robot, "robot.urdf", "robot.yaml"),
+        (partial(vkc.importing.import_robot, samples=20), "robot.urdf", "robot.yaml"),
         (vkc.importing.import_home, "cabinet.urdf", "scene.yaml"),
     ],
 )

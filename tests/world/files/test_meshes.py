@@ -212,6 +212,22 @@ def test_colours_divide_meshes_into_parts(tmp_path: Path) -> None:
     assert shape.num_tris == len(parts[0].faces)
 
 
+def test_changed_files_are_read_again(tmp_path: Path) -> None:
+    """What a process keeps of a mesh is compared with the files of the mesh and its materials."""
+    file, materials = write_two_cubes(tmp_path / "two.obj"), tmp_path / "two.mtl"
+    texts = {path: path.read_text(encoding="utf-8") for path in (file, materials)}
+    blue, red, green = (0.0, 0.0, 1.0, 1.0), (1.0, 0.0, 0.0, 1.0), (0.0, 1.0, 0.0, 1.0)
+    assert {part.colour for part in load_parts(file)} == {blue, red}
+    materials.write_text(texts[materials].replace("Kd 1.0 0.0", "Kd 0.0 1.0"), encoding="utf-8")
+    assert {part.colour for part in load_parts(file)} == {blue, green}
+    materials.unlink()
+    assert not {part.colour for part in load_parts(file)} & {blue, red, green}
+    materials.write_text(texts[materials], encoding="utf-8")
+    assert {part.colour for part in load_parts(file)} == {blue, red}
+    file.write_text(texts[file] + "f 1 2 3\n", encoding="utf-8")
+    assert sum(len(part.faces) for part in load_parts(file)) == 25
+
+
 def test_simplified_meshes_keep_their_shape(tmp_path: Path) -> None:
     ball = trimesh.creation.icosphere(subdivisions=5, radius=0.1)
     ball.export(tmp_path / "ball.stl")

@@ -12,6 +12,7 @@ import codecs
 import contextlib
 import io
 import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -51,6 +52,7 @@ __all__ = [
 
 _MAX_NEIGHBOURS = 255  # coal's corners have no more
 _MAX_CACHED_HULLS = 512  # that a process keeps: robots are loaded again and again
+_MAX_KEPT_MESHES = 256  # for display, likewise: a robot has 20
 _SMALLEST = 1e-6  # [m] size of meshes, below which triangles have no area in floating point
 _HULL_TOLERANCE = 1e-6  # how far, relatively, coal's volume and area may be from trimesh's
 
@@ -218,13 +220,18 @@ def _make_resolver(file: Path) -> Any:
     def get(name: str) -> bytes:
         if is_gltf and not (file.parent / name).exists():
             name = unquote(name)
-        for place in (file.parent / name.strip(), file.parent / Path(name).name):
+        for place in _list_places(file, name):
             if place.exists() and not place.is_file():
                 raise FileNotFoundError(f"{place} is not a regular file")  # it may be endless
         return bytes(read(name))
 
     resolver.get = get
     return resolver
+
+
+def _list_places(file: Path, name: str) -> tuple[Path, Path]:
+    """Return the places at which trimesh looks for a file that a mesh names."""
+    return file.parent / name.strip(), file.parent / Path(name).name
 
 
 def load_convex(
@@ -312,6 +319,12 @@ def make_convex_hull(
     return shape
 
 
+Versions = dict[Path, tuple[int, int] | None]
+"""Times of change [ns] and sizes [bytes] of files, None where there is no file."""
+_kept_parts: dict[tuple[Path, tuple[float, ...], float], tuple[Versions, list[MeshPart]]] = {}
+"""Parts by file, scale and detail, with the versions of all files that were read for them."""
+
+
 def load_parts(
     path: str | Path, scale: ArrayLike = (1.0, 1.0, 1.0), *, detail: float = 0.0
 ) -> list[MeshPart]:
@@ -322,8 +335,6 @@ def load_parts(
         scale: Factor from the file's unit to [m], or one for each axis.
         detail: Cell size of `simplify_mesh` [m]; 0 keeps all triangles.
     """
-    import trimesh
-
     file = Path(path)
     if file.suffix.lower() != ".obj" or not file.is_file():
         whole = load_mesh(file, scale)
@@ -331,8 +342,41 @@ def load_parts(
             simplify_mesh(MeshPart(np.asarray(whole.vertices), np.asarray(whole.faces)), detail)
         ]
     factors = _check_scale(file, scale)
+    key = (file.absolute(), tuple(factors.tolist()), detail)
+    versions, parts = _kept_parts.pop(key, ({}, []))
+    if not versions or versions != _read_versions(versions):
+        versions = _read_versions([file])
+        parts = [simplify_mesh(part, detail) for part in _read_obj_parts(file, factors, versions)]
+    _kept_parts[key] = versions, parts  # as the last one
+    while len(_kept_parts) > _MAX_KEPT_MESHES:
+        del _kept_parts[next(iter(_kept_parts))]
+    return list(parts)
+
+
+def _read_versions(files: Iterable[Path]) -> Versions:
+    found: Versions = {}
+    for file in files:
+        found[file] = None
+        with contextlib.suppress(OSError):
+            stat = file.stat()
+            found[file] = (stat.st_mtime_ns, stat.st_size)
+    return found
+
+
+def _read_obj_parts(file: Path, factors: Floats, versions: Versions) -> list[MeshPart]:
+    """Read the parts of an OBJ file, and add its materials and textures to `versions`."""
+    import trimesh
+
     try:
         source, settings = _open_mesh(file)
+        resolver = settings["resolver"]
+        read = resolver.get
+
+        def get(name: str) -> bytes:
+            versions.update(_read_versions(_list_places(file, name)))
+            return bytes(read(name))
+
+        resolver.get = get
         scene = trimesh.load_scene(
             source, process=False, group_material=True, split_object=False, **settings
         )
@@ -351,7 +395,7 @@ def load_parts(
         ) from error
     if not parts:
         raise InputError("the mesh is empty", file=file, expected="at least one triangle")
-    return [simplify_mesh(part, detail) for part in parts]
+    return parts
 
 
 def simplify_mesh(part: MeshPart, detail: float) -> MeshPart:

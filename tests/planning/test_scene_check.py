@@ -20,6 +20,14 @@ from vkc_pin.world.scene.scene import Scene
 DRAWER = load_drawer_scene().objects["drawer"].object
 
 
+def keep_attachment(scene: Scene, name: str, attachment: str) -> Scene:
+    """Return a scene whose only object has a single attachment."""
+    placed = scene.objects[name]
+    kept = {attachment: placed.object.attachments[attachment]}
+    only = dataclasses.replace(placed.object, attachments=kept)
+    return dataclasses.replace(scene, objects={name: dataclasses.replace(placed, object=only)})
+
+
 @pytest.fixture(scope="module")
 def drawer_check() -> SceneCheck:
     return check_scene(load_drawer_scene())
@@ -49,7 +57,8 @@ def test_reachable_configurations_are_valid(drawer_check: SceneCheck) -> None:
 
 
 def test_blocked_attachments_name_the_obstacle() -> None:
-    blocked = check_scene(add_boxes(load_drawer_scene(), box=((0.2, 1.6, 1.2), (1.66, 0.0, 0.6))))
+    scene = add_boxes(load_drawer_scene(), box=((0.2, 1.6, 1.2), (1.66, 0.0, 0.6)))
+    blocked = check_scene(keep_attachment(scene, "drawer", "handle"))
     assert not blocked.ok
     assert all(one.configuration is None and "box" in one.because for one in blocked.attachments)
     assert any("not reached" in line for line in blocked.lines())
@@ -74,13 +83,12 @@ def test_grasped_objects_are_not_checked() -> None:
 
 def test_overlaps_and_close_pairs_are_reported(tmp_path: Path) -> None:
     x, y, _ = load_drawer_scene().start[:3]
-    found = check_scene(
-        add_boxes(
-            load_drawer_scene(),
-            side=((0.6, 0.1, 0.9), (2.0, 0.295 + 0.05 + 0.004, 0.45)),
-            post=((0.1, 0.1, 1.0), (x, y, 0.5)),
-        )
+    scene = add_boxes(
+        load_drawer_scene(),
+        side=((0.6, 0.1, 0.9), (2.0, 0.295 + 0.05 + 0.004, 0.45)),
+        post=((0.1, 0.1, 1.0), (x, y, 0.5)),
     )
+    found = check_scene(keep_attachment(scene, "drawer", "handle"))
     assert not found.ok
     assert found.problems
     assert all("post" in line and "overlap" in line for line in found.problems)
@@ -98,13 +106,15 @@ def test_overlaps_and_close_pairs_are_reported(tmp_path: Path) -> None:
 
 def make_small_arena() -> Scene:
     arena = {"x": [-1.2, -0.4], "y": [0.1, 0.9]}
-    return replace_scene_fields(load_drawer_scene(), arena=arena, start_region=arena)
+    fields = {"arena": arena, "start_region": arena, "objects": []}
+    return replace_scene_fields(load_drawer_scene(), **fields)
 
 
 def make_cell() -> Scene:
     boxes = [((0.1, 2.2, 1.0), (x, 0.5, 0.5)) for x in (-1.6, 0.0)]
     boxes += [((2.2, 0.1, 1.0), (-0.8, y, 0.5)) for y in (-0.3, 1.3)]
-    return add_boxes(load_drawer_scene(), **{f"wall_{k}": box for k, box in enumerate(boxes)})
+    empty = replace_scene_fields(load_drawer_scene(), objects=[])
+    return add_boxes(empty, **{f"wall_{k}": box for k, box in enumerate(boxes)})
 
 
 @pytest.mark.parametrize("make_scene", [make_small_arena, make_cell])
@@ -137,11 +147,7 @@ def load_cup_scene(attachment: str) -> Scene:
     """Return a scene with a cup that has a single attachment."""
     scene = vkc.load_scene("tray")
     (cup,) = (one for one in scene.document["objects"] if one["name"] == "cup")
-    alone = replace_scene_fields(scene, objects=[cup])
-    placed = alone.objects["cup"]
-    kept = {attachment: placed.object.attachments[attachment]}
-    only = dataclasses.replace(placed.object, attachments=kept)
-    return dataclasses.replace(alone, objects={"cup": dataclasses.replace(placed, object=only)})
+    return keep_attachment(replace_scene_fields(scene, objects=[cup]), "cup", attachment)
 
 
 @pytest.mark.parametrize(

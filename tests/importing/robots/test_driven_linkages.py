@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from helpers.arm_urdf import write_arms
@@ -144,3 +145,65 @@ def test_slides_of_four_fingers_follow_one_motor(tmp_path: Path) -> None:
     assert stated["gripper"].keys() == {"drive"}
     assert gripper.max_opening == pytest.approx(0.06, abs=2e-3)
     assert gripper.min_opening == pytest.approx(0.0, abs=2e-3)
+
+
+def format_swinging_side(sign: int, length: float, y: float, limits: tuple[float, float]) -> str:
+    """Return a bar that swings from the hand, and a pad at its end that stays parallel.
+
+    The left one leads. The pad is 40 mm long and 8 mm thick.
+    """
+    side = "left" if sign > 0 else "right"
+    bar, pad = f"{side}_bar", f"{side}_pad"
+    turned = (-limits[1], -limits[0])
+    return "".join(
+        [
+            format_link(bar, f"0.02 0.008 {length}", f"0 0 {length / 2.0}"),
+            format_joint(
+                "drive" if sign > 0 else f"{bar}_joint",
+                "revolute",
+                "hand",
+                bar,
+                f"0 {sign * y} 0.06",
+                f"{sign} 0 0",
+                limits,
+                inside="" if sign > 0 else follow(),
+            ),
+            format_link(pad, "0.02 0.008 0.04", "0 0 0.02"),
+            format_joint(
+                f"{pad}_joint",
+                "revolute",
+                bar,
+                pad,
+                f"0 0 {length}",
+                f"{sign} 0 0",
+                turned,
+                inside=follow(-1.0),
+            ),
+        ]
+    )
+
+
+@pytest.mark.parametrize(
+    ("length", "y", "limits"),
+    [
+        (0.08, 0.07, (0.0, 0.8)),
+        (0.1, 0.06, (-0.2, 0.5)),
+        (0.12, 0.1, (0.0, 0.75)),
+        (0.05, 0.055, (-0.1, 1.0)),
+        (0.09, 0.075, (0.0, 0.78)),
+        (0.07, 0.065, (0.0, 0.9)),
+        (0.06, 0.04, (-0.6, 0.5)),
+        (0.1, 0.02, (-0.7, 0.1)),  # the pads come forward as they close
+    ],
+)
+def test_fingers_that_draw_back_as_they_close_enclose_the_tool_frame(
+    tmp_path: Path, length: float, y: float, limits: tuple[float, float]
+) -> None:
+    sides = [format_swinging_side(sign, length, y, limits) for sign in (1, -1)]
+    file = write_gripper(tmp_path / "given", *sides)
+    imported = vkc.importing.import_robot(file, tmp_path / "mine", samples=60)
+    gripper = imported.robot.gripper
+    assert gripper is not None
+    low, high = limits
+    for opening, angle in ((gripper.max_opening, low), (gripper.min_opening, high)):
+        assert opening == pytest.approx(2.0 * (y - length * np.sin(angle) - 0.004), abs=1e-3)

@@ -409,7 +409,8 @@ class _HandAnalysis:
         best, room, chosen = pin.SE3.Identity(), -1.0, states[0]
         for shifts in ([(0.0, 0.0)], list(itertools.product(_AHEAD, _ASIDE))):
             for state in states:
-                tool, shapes = self._find_tool(first, second, state), self._place_shapes(state)
+                tool = self._find_tool(first, second, state, {**opened, **closed})
+                shapes = self._place_shapes(state)
                 for ahead, aside in shifts:
                     moved = tool * pin.SE3(np.eye(3), np.array([aside, 0.0, ahead]))
                     wider = _measure_room(shapes, moved)
@@ -420,9 +421,16 @@ class _HandAnalysis:
         return best, chosen
 
     def _find_tool(
-        self, first: Sequence[Body], second: Sequence[Body], opened: Positions
+        self,
+        first: Sequence[Body],
+        second: Sequence[Body],
+        opened: Positions,
+        closed: Positions,
     ) -> pin.SE3:
-        """Return the tool frame between the fingertips of an open hand, in the palm's frame."""
+        """Return the tool frame between the fingertips of an open hand, in the palm's frame.
+
+        Fingers that swing draw back as they close, and still enclose the frame.
+        """
         approach = self._approach
         a, b = self._find_tips(first, second, opened, approach)
         closing = b.mean(axis=0) - a.mean(axis=0)
@@ -432,6 +440,9 @@ class _HandAnalysis:
         along = np.vstack([self._find_points(finger, opened) for finger in fingers]) @ approach
         depth = min(float((a @ approach).max()), float((b @ approach).max()))
         depth -= min(_PAD, _SHARE * float(along.max() - along.min()))
+        closed_tips = self._find_tips(first, second, closed, approach)
+        closed_depth = min(float((tips @ approach).max()) for tips in closed_tips)
+        depth = min(depth, closed_depth - _ENCLOSED)
         side = np.cross(approach, closing)
         across = 0.5 * (float((a @ side).mean()) + float((b @ side).mean()))
         place = inner * closing + across * side + depth * approach

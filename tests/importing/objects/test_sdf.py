@@ -556,3 +556,53 @@ def test_exponentially_many_models_are_rejected(tmp_path: Path) -> None:
         (tmp_path / f"m{k}.sdf").write_text(f'<sdf version="1.7">{model}</sdf>')
     with pytest.raises(InputError, match=r"m0\.sdf: too many models"):
         read_object_sdf(tmp_path / "m0.sdf")
+
+
+def format_follower(child: str, leader: str, limits: tuple[float, float], **mimic: float) -> str:
+    """Return a link and its slide, which follows another one if there is a leader."""
+    content = "".join(f"<{key}>{value}</{key}>" for key, value in mimic.items())
+    coupling = f'<mimic joint="{leader}">{content}</mimic>' if leader else ""
+    ends = f"<lower>{limits[0]}</lower><upper>{limits[1]}</upper>"
+    box = "<geometry><box><size>0.1 0.1 0.1</size></box></geometry>"
+    return (
+        f'<link name="{child}"><collision name="c">{box}</collision></link>'
+        f'<joint name="to_{child}" type="prismatic"><parent>base</parent><child>{child}</child>'
+        f"<axis><xyz>0 1 0</xyz><limit>{ends}</limit>{coupling}</axis></joint>"
+    )
+
+
+@pytest.mark.parametrize(
+    ("limits", "mimic", "expected"),
+    [
+        ((0.0, 0.4), {"multiplier": -1.0}, (-0.4, 0.0)),
+        ((-0.2, 0.0), {"multiplier": -1.0}, (-0.2, 0.0)),
+        ((-1e16, 1e16), {"multiplier": 0.5, "offset": 0.1}, (0.1, 0.3)),
+        ((0.0, 9.0), {"multiplier": 2.0, "reference": 0.1, "offset": 0.3}, (0.1, 0.9)),
+        ((0.0, 0.4), {}, (0.0, 0.4)),
+        ((1.0, 1.4), {"multiplier": -2.0}, (-0.8, 0.0)),
+    ],
+)
+@pytest.mark.parametrize("is_nested", [False, True])
+def test_followers_keep_the_limits_that_their_leaders_reach(
+    tmp_path: Path,
+    limits: tuple[float, float],
+    mimic: dict[str, float],
+    expected: tuple[float, float],
+    is_nested: bool,
+) -> None:
+    """A third joint follows the second one; joints in a circle keep their limits."""
+    content = (
+        '<link name="base"/>'
+        + format_follower("third", "to_second", (-9.0, 9.0), multiplier=-1.0)
+        + format_follower("second", "to_first", limits, **mimic)
+        + format_follower("first", "", (0.0, 0.4))
+        + format_follower("one", "to_other", (0.0, 1.0), multiplier=-1.0)
+        + format_follower("other", "to_one", (0.0, 1.0), multiplier=-1.0)
+    )
+    nested = f'<model name="part">{content}</model>' if is_nested else content
+    text = f'<sdf version="1.11"><model name="m">{nested}</model></sdf>'
+    found = {joint.name: joint.limits for joint in read_model(tmp_path, text).joints.values()}
+    assert found["to_second"] == pytest.approx(expected)
+    assert found["to_third"] == pytest.approx((-expected[1], -expected[0]))
+    assert found["to_first"] == (0.0, 0.4)
+    assert found["to_one"] == found["to_other"] == (0.0, 1.0)

@@ -124,3 +124,48 @@ def test_huge_limits_count_as_unlimited(
     links = LINKS + format_joint("fixed", "c")
     joint = read_text(tmp_path, links + format_joint(kind, "b", f"<limit {limit}/>")).joints["b"]
     assert (joint.kind, joint.limits, joint.velocity) == (*expected, None)
+
+
+FORWARD = '<limit lower="0" upper="1.5"/>'
+
+
+@pytest.mark.parametrize(
+    ("leader", "follower", "mimic", "expected"),
+    [
+        (FORWARD, FORWARD, 'multiplier="-1"', (-1.5, 0.0)),  # limits copied from the leader
+        (FORWARD, '<limit lower="-1.5" upper="0"/>', 'multiplier="-1"', (-1.5, 0.0)),
+        (FORWARD, "", 'multiplier="-1"', (-1.5, 0.0)),
+        (FORWARD, '<limit lower="-1e16" upper="1e16"/>', 'multiplier="0.5"', (0.0, 0.75)),
+        (FORWARD, '<limit lower="-3" upper="3"/>', 'multiplier="2" offset="-1"', (-1.0, 2.0)),
+        (FORWARD, '<limit lower="0" upper="1"/>', "", (0.0, 1.0)),
+        (FORWARD, '<limit lower="0" upper="1"/>', 'offset="4"', (4.0, 5.5)),
+        ("", FORWARD, 'multiplier="-1"', (0.0, 1.5)),
+        ('<limit lower="0" upper="1e16"/>', FORWARD, 'multiplier="-1"', (-np.inf, 0.0)),
+    ],
+)
+def test_followers_keep_the_limits_that_their_leaders_reach(
+    tmp_path: Path,
+    leader: str,
+    follower: str,
+    mimic: str,
+    expected: tuple[float, float],
+) -> None:
+    first = format_joint("revolute", "b", leader)
+    second = format_joint("revolute", "c", f'{follower}<mimic joint="to_b" {mimic}/>')
+    for joints in (first + second, second + first):
+        found = read_text(tmp_path, LINKS + joints)
+        assert found.joints["c"].limits == pytest.approx(expected)
+        (note,) = found.notes
+        assert "'to_c' mimics 'to_b': made independent" in note
+
+
+def test_chains_of_followers_are_limited_by_their_leader(tmp_path: Path) -> None:
+    links = LINKS + '<link name="d"/>'
+    chain = (
+        format_joint("revolute", "d", FORWARD + '<mimic joint="to_c" multiplier="-1"/>')
+        + format_joint("revolute", "c", FORWARD + '<mimic joint="to_b" multiplier="-0.5"/>')
+        + format_joint("revolute", "b", FORWARD)
+    )
+    found = read_text(tmp_path, links + chain)
+    assert found.joints["c"].limits == pytest.approx((-0.75, 0.0))
+    assert found.joints["d"].limits == pytest.approx((0.0, 0.75))

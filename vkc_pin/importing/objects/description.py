@@ -28,6 +28,7 @@ __all__ = [
     "Joint",
     "Link",
     "Part",
+    "limit_follower",
     "make_inertia",
     "make_limits",
 ]
@@ -291,6 +292,27 @@ def make_limits(low: float, high: float) -> tuple[float, float] | None:
     low = low if low > -MAX_COORDINATE else -math.inf
     high = high if high < MAX_COORDINATE else math.inf
     return None if math.isinf(low) and math.isinf(high) else (low, high)
+
+
+def limit_follower(
+    own: tuple[float, float] | None,
+    leader: tuple[float, float] | None,
+    factor: float,
+    offset: float,
+) -> tuple[float, float] | None:
+    """Return the limits of a joint whose position is factor · leader's position + offset.
+
+    Its own limits count where its leader reaches them: they may be a copy of the leader's, with
+    which the follower of a negative factor could not move.
+    """
+    if leader is None:
+        return own
+    ends = sorted(factor * end + offset for end in leader)
+    reached = (ends[0], ends[1])
+    if own is None:
+        return reached
+    common = (max(own[0], reached[0]), min(own[1], reached[1]))
+    return common if common[0] < common[1] else reached
 
 
 def make_inertia(mass: float, moments: Iterable[float], placement: pin.SE3) -> pin.Inertia:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
 import xml.etree.ElementTree as ElementTree
@@ -20,6 +21,7 @@ from vkc_pin.importing.objects.description import (
     Joint,
     Link,
     Part,
+    limit_follower,
     make_inertia,
     make_limits,
 )
@@ -78,6 +80,8 @@ class _Reader:
     def __init__(self, file: Path, packages: Mapping[str, Path]) -> None:
         self.file, self.packages, self.count = file, packages, 0
         self.notes, self.missing = list[str](), list[MissingMesh]()
+        # Full name of the leader, factor and offset of each follower, by the follower's full name
+        self.followers = dict[str, tuple[str, float, float]]()
         root, rules = self._load(file)
         worlds, models = root.findall("world"), root.findall("model")
         if len(worlds) + len(models) != 1:
@@ -305,8 +309,35 @@ class _Reader:
                     child=names[name],
                     placement=frames[name],
                 )
+        children = {
+            holder.path + joint.get("name", ""): names[child]
+            for child, (holder, joint, _) in joints.items()
+            if names[child] in found_joints
+        }
+        self._limit_followers(found_joints, children)
         notes, missing = tuple(self.notes), tuple(self.missing)
         return Description(self.file, found_links, found_joints, notes, missing)
+
+    def _limit_followers(self, joints: dict[str, Joint], children: Mapping[str, str]) -> None:
+        """Restrict followers to what their leaders' limits let them reach, leaders first.
+
+        Those in a circle keep their limits.
+
+        Args:
+            joints: Joints by their child, which are updated.
+            children: Child of each joint, by the full name of the joint.
+        """
+        left = {name: mimic for name, mimic in self.followers.items() if name in children}
+        while ready := [name for name, (leader, _, _) in left.items() if leader not in left]:
+            for name in ready:
+                leader, factor, offset = left.pop(name)
+                if leader not in children or not factor:
+                    continue
+                joint = joints[children[name]]
+                led_by = joints[children[leader]].limits
+                limits = limit_follower(joint.limits, led_by, factor, offset)
+                if joint.kind in ("revolute", "prismatic") and limits != joint.limits:
+                    joints[children[name]] = dataclasses.replace(joint, limits=limits)
 
     def _connect(
         self,
@@ -399,8 +430,16 @@ class _Reader:
             axis = self._read_axis(scope, joint, element)
             limits, settings["velocity"] = self._read_limits(scope, element, name)
             settings |= self._read_dynamics(scope, element, name)
-            if element.find("mimic") is not None:
+            mimic = element.find("mimic")
+            if mimic is not None:
                 self.notes.append(f"joint '{name}' mimics another one: made independent")
+                factor, offset, reference = (
+                    scope.read_numbers(mimic, key, 1, default, name)[0]
+                    for key, default in (("multiplier", "1"), ("offset", "0"), ("reference", "0"))
+                )
+                leader = scope.path + mimic.get("joint", "").strip()
+                own = scope.path + joint.get("name", "")
+                self.followers[own] = (leader, factor, offset - factor * reference)
         return Joint(
             name=name,
             kind=kind,

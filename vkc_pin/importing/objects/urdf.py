@@ -17,6 +17,7 @@ from vkc_pin.importing.objects.description import (
     Joint,
     Link,
     Part,
+    limit_follower,
     make_inertia,
     make_limits,
 )
@@ -28,6 +29,7 @@ from vkc_pin.world.files.kinematic_tree import (
 )
 from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.files.xml import read_xml
+from vkc_pin.world.models.couplings import find_followers
 
 __all__ = ["read_object_urdf"]
 
@@ -54,6 +56,7 @@ def read_object_urdf(
     stated = {
         joint.get("name", ""): _read_limits(file, joint, notes) for joint in root.findall("joint")
     }
+    reached = _limit_followers(file, root, stated)
     for joint in root.findall("joint"):
         if joint.get("type") not in (*_KINDS, "floating") or (
             joint.get("type") == "floating" and not free
@@ -61,10 +64,14 @@ def read_object_urdf(
             notes.append(f"joint '{joint.get('name')}' is {joint.get('type')}: taken as fixed")
             joint.set("type", "fixed")
         if (mimic := joint.find("mimic")) is not None:
-            notes.append(
-                f"joint '{joint.get('name')}' mimics '{mimic.get('joint')}': made independent"
-            )
+            name = joint.get("name", "")
+            note = f"joint '{name}' mimics '{mimic.get('joint')}': made independent"
+            limits = reached.get(name)
+            if limits is not None and limits != stated[name]:
+                note += f", from {limits[0]:g} to {limits[1]:g}, which its leader reaches"
+            notes.append(note)
             joint.remove(mimic)
+    stated |= reached
     # `check_tree` makes hinges with huge limits continuous.
     kinds = {joint.get("name", ""): joint.get("type", "") for joint in root.findall("joint")}
     check_tree(file, root)
@@ -144,6 +151,25 @@ def _read_limits(
         limit.set("lower", str(low))
         limit.set("upper", str(high))
     return make_limits(low, high)
+
+
+def _limit_followers(
+    file: Path, root: ElementTree.Element, stated: Mapping[str, tuple[float, float] | None]
+) -> dict[str, tuple[float, float] | None]:
+    """Return the limits of followers, within what the `stated` ones of leaders let them reach."""
+    for joint in root.findall("joint"):
+        mimic = joint.find("mimic")
+        if mimic is not None:
+            name = joint.get("name", "")
+            parse_numbers(file, mimic, "multiplier", 1, default="1", where=name)
+            parse_numbers(file, mimic, "offset", 1, default="0", where=name)
+    return {
+        name: limit_follower(
+            stated[name], stated[coupling.leader], coupling.factor, coupling.offset
+        )
+        for name, coupling in find_followers(root).items()
+        if coupling.factor
+    }
 
 
 def _read_inertia(file: Path, link: ElementTree.Element, notes: list[str]) -> pin.Inertia:

@@ -1,4 +1,4 @@
-"""Compares kinds of bases at a door and a drawer."""
+"""Compares kinds of bases at a door and a drawer, of the scenes' robot or of others."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from vkc_pin.benchmarks.harness import runner
 from vkc_pin.benchmarks.harness.record import Record, distribution, trial
 from vkc_pin.benchmarks.harness.runner import Execution
 from vkc_pin.benchmarks.harness.tables import JUDGED, count, format_table, join_sections, select
+from vkc_pin.errors import InputError
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
 from vkc_pin.world.scene.scene import Scene, load_scene
@@ -31,9 +32,22 @@ BASES: dict[str, dict[str, Any]] = {
 """Kind of base → further fields of the scene's robot."""
 
 
-def make_start(task: str, base: str, seed: int, number: int) -> Scene:
-    """Return a scene with a random start, which is the same for every kind of base."""
-    scene = load_scene(task).sample_start(np.random.default_rng([seed, number]))
+def make_start(
+    task: str, base: str, seed: int, number: int, robot_file: str | None = None
+) -> Scene:
+    """Return a scene with a random start, which is the same for every kind of base.
+
+    Args:
+        task: Scene.
+        base: One of `BASES`.
+        seed: Random seed.
+        number: Number of the start.
+        robot_file: Another robot; see `Scene.with_robot`.
+    """
+    scene = load_scene(task)
+    if robot_file is not None:
+        scene = scene.with_robot(robot_file)
+    scene = scene.sample_start(np.random.default_rng([seed, number]))
     robot = {**scene.document["robot"], "base": base, **BASES[base]}
     return Scene.from_document({**scene.document, "robot": robot}, scene.folder)
 
@@ -45,6 +59,7 @@ def run(
     seed: int = 0,
     tasks: Sequence[str] | None = None,
     bases: Sequence[str] | None = None,
+    robots: Sequence[str] | None = None,
     **execution: Unpack[Execution],
 ) -> dict[str, Any]:
     """Run the experiment in the folder `out`; see `runner.run`.
@@ -55,26 +70,36 @@ def run(
         seed: Random seed of starts and planning.
         tasks: Some of `TASKS`. Default: all.
         bases: Some of `BASES`. Default: all.
+        robots: Names or robot.yaml files of other robots; see `Scene.with_robot`. Default: that of
+            the scenes.
+
+    Raises:
+        InputError: A robot is invalid, or two have the same name.
     """
     runner.check_positive(trials=trials)
     tasks = list(runner.select_names("task", TASKS if tasks is None else tasks, TASKS))
     bases = list(runner.select_names("base", BASES if bases is None else bases, BASES))
+    files = _name_robots(robots)
     settings = {
         "benchmark": "bases",
         "seed": seed,
         "starts": trials,
         "tasks": tasks,
         "bases": bases,
+        "robots": list(files),
         "radius": TURNING_RADIUS,
     }
     specs = [
         {
-            "key": f"{task}-{base}-{number:04d}",
+            "key": f"{name}-{task}-{base}-{number:04d}",
+            "robot": name,
+            "file": file,
             "task": task,
             "base": base,
             "number": number,
             "seed": seed,
         }
+        for name, file in files.items()
         for task in tasks
         for base in bases
         for number in range(trials)
@@ -84,17 +109,37 @@ def run(
     )
 
 
+def _name_robots(robots: Sequence[str] | None) -> dict[str, str | None]:
+    """Return name → name or file of each robot; None: that of the scenes."""
+    if robots is None:
+        return {load_scene(next(iter(TASKS))).robot.name: None}
+    found = {load_scene(next(iter(TASKS))).with_robot(robot).robot.name: robot for robot in robots}
+    if not found or len(found) < len(robots):
+        raise InputError(
+            "not a choice",
+            field="robots",
+            expected="robots of different names",
+            got=" ".join(robots) or "none",
+        )
+    return dict(found)
+
+
 def format_results(result: Mapping[str, Any]) -> str:
     """Return the table of a result in Markdown."""
     about, records = result["meta"], result["trials"]
-    rows = [_row(task, base, records) for task in about["tasks"] for base in about["bases"]]
+    rows = [
+        _row(robot, task, base, records)
+        for robot in about["robots"]
+        for task in about["tasks"]
+        for base in about["bases"]
+    ]
     lines = [
-        f"- {r['task']}, {r['base']}, start {r['number']}: {r['status']}; "
+        f"- {r['robot']}, {r['task']}, {r['base']}, start {r['number']}: {r['status']}; "
         f"{'; '.join(r['violations']) or 'no violation'}"
         for r in records
         if not r["success"]
     ]
-    head = ["task", "base", "success", "time, median [s]", "95th percentile [s]"]
+    head = ["robot", "task", "base", "success", "time, median [s]", "95th percentile [s]"]
     head += ["evaluations", "Ipopt iterations", "base [m]", "arm [rad]", "motion [s]"]
     return join_sections(
         about,
@@ -107,8 +152,8 @@ def format_results(result: Mapping[str, Any]) -> str:
     )
 
 
-def _row(task: str, base: str, records: Sequence[Record]) -> list[str]:
-    own = select(records, task=task, base=base)
+def _row(robot: str, task: str, base: str, records: Sequence[Record]) -> list[str]:
+    own = select(records, robot=robot, task=task, base=base)
     times = [f"{value:.3f}" for value in distribution(own, "planning_time")]
     counts = [f"{distribution(own, field)[0]:.0f}" for field in ("evaluations", "iterations")]
     good = select(own, success=True)
@@ -116,15 +161,16 @@ def _row(task: str, base: str, records: Sequence[Record]) -> list[str]:
         f"{distribution(good, field)[0]:.2f}"
         for field in ("base_path_length", "arm_path_length", "duration")
     ]
-    return [task, base, count(own), *times, *counts, *lengths]
+    return [robot, task, base, count(own), *times, *counts, *lengths]
 
 
 def _record(spec: dict[str, Any]) -> dict[str, Any]:
     task, base, seed, number = (spec[field] for field in ("task", "base", "seed", "number"))
     found: Plan = plan(
-        make_start(task, base, seed, number), [Actuate(task, TASKS[task])], seed=seed
+        make_start(task, base, seed, number, spec["file"]), [Actuate(task, TASKS[task])], seed=seed
     )
     if found.status == "interrupted":
         raise KeyboardInterrupt
-    about = {"task": task, "base": base, "number": number, "duration": found.metrics["duration"]}
-    return trial(found, method="VKC", seed=seed, **about)
+    about = {"robot": spec["robot"], "task": task, "base": base, "number": number}
+    duration = found.metrics["duration"]
+    return trial(found, method="VKC", seed=seed, duration=duration, **about)

@@ -111,6 +111,8 @@ def _add_scenes(benches: Any) -> None:
     _add_count(parser, "--trials", 50, "random starts per task and base")
     _add_choice(parser, "tasks", "door drawer (default: both)")
     _add_choice(parser, "bases", "omni differential ackermann (default: all)")
+    about = "names or robot.yaml files of other robots (default: the robot of the scenes)"
+    parser.add_argument("--robots", nargs="+", metavar="ROBOT", help=about)
 
     parser = _add_experiment(benches, "gap", "reach over a table beyond a gap of 0.85 m")
     _add_count(parser, "--trials", 50, "random starts of base and arm")

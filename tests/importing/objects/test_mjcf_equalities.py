@@ -168,3 +168,44 @@ def test_held_leaf_of_an_imported_cabinet_stands_open(tmp_path: Path) -> None:
     done = vkc.importing.import_object(tmp_path / "c.xml", tmp_path / "out")
     assert done.object.coordinates.names == ("left",)
     assert any("'right' is held at -0.4" in note for note in done.notes)
+
+
+FORWARD = 'range="0 1.5"'
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "coefficients", "expected"),
+    [
+        (FORWARD, FORWARD, "0 -1 0 0 0", (-1.5, 0.0)),  # a range copied from the leader
+        (FORWARD, 'range="-1 0"', "0 -1 0 0 0", (-1.0, 0.0)),
+        (FORWARD, 'range="-9 9" ref="0.5"', "0.5 2 0 0 0", (0.5, 3.5)),
+        ('range="0.2 1.7" ref="0.2"', 'limited="false"', "0 -0.5 0 0 0", (-0.75, 0.0)),
+        ('limited="false"', FORWARD, "0 -1 0 0 0", (0.0, 1.5)),
+        (FORWARD, FORWARD, "0 1 0.5 0 0", (0.0, 1.5)),  # no straight line
+    ],
+)
+def test_followers_keep_the_limits_that_their_leaders_reach(
+    tmp_path: Path, left: str, right: str, coefficients: str, expected: tuple[float, float]
+) -> None:
+    """A third joint follows the second one; a circle ends at its first joint."""
+    couplings = '<joint joint1="third" joint2="right" polycoef="0 -1 0 0 0"/>'
+    couplings += f'<joint joint1="right" joint2="left" polycoef="{coefficients}"/>'
+    couplings += '<joint joint1="one" joint2="other" polycoef="0 -1 0 0 0"/>'
+    couplings += '<joint joint1="other" joint2="one" polycoef="0 -1 0 0 0"/>'
+    settings = {"left": left, "right": right, "third": 'range="-9 9"', "one": FORWARD}
+    settings["other"] = FORWARD
+    bodies = "".join(
+        f'<body><joint name="{name}" {text}/><geom size="0.1"/></body>'
+        for name, text in settings.items()
+    )
+    (tmp_path / "t.xml").write_text(
+        f'<mujoco><compiler angle="radian"/><worldbody>{bodies}</worldbody>'
+        f"<equality>{couplings}</equality></mujoco>"
+    )
+    found = {
+        joint.name: joint.limits for joint in read_object_mjcf(tmp_path / "t.xml").joints.values()
+    }
+    assert found["right"] == pytest.approx(expected)
+    assert found["third"] == pytest.approx((-expected[1], -expected[0]))
+    assert found["one"] == (-1.5, 0.0)
+    assert found["other"] == (0.0, 1.5)

@@ -9,7 +9,14 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.importing.mjcf_models import NO_MASS, compile_mjcf
-from vkc_pin.importing.objects.description import Description, Joint, Link, Part, make_limits
+from vkc_pin.importing.objects.description import (
+    Description,
+    Joint,
+    Link,
+    Part,
+    limit_follower,
+    make_limits,
+)
 from vkc_pin.importing.objects.mjcf_equalities import FREE, list_joints, read_equalities
 from vkc_pin.utils.optional_imports import import_optional
 
@@ -120,15 +127,12 @@ class _Reader:
         name = self._find_name("joint", number)
         if kind == "fixed":
             self.notes.append(f"joint '{name}' is a ball joint: taken as fixed")
-        limits, address = None, model.jnt_qposadr[number]
+        address = model.jnt_qposadr[number]
         zero = 0.0 if kind == "fixed" else float(model.qpos0[address])
         if zero:
             self.notes.append(
                 f"joint '{name}' is at its `ref` in the file: values are less by {zero:.4g}"
             )
-        if model.jnt_limited[number]:
-            low, high = (float(value) - zero for value in model.jnt_range[number])
-            limits = make_limits(low, high)
         joint = Joint(
             name=name,
             kind=kind,
@@ -136,7 +140,7 @@ class _Reader:
             child=child,
             placement=frames[parent].inverse() * frames[child],
             axis=np.asarray(frames[child].rotation.T @ self.data.xaxis[number]),
-            limits=limits,
+            limits=None if kind == "fixed" else self._find_limits(number),
             damping=float(np.ravel(model.dof_damping[model.jnt_dofadr[number]])[0]),
             friction=float(model.dof_frictionloss[model.jnt_dofadr[number]]),
             stiffness=float(np.ravel(model.jnt_stiffness[number])[0]),
@@ -144,6 +148,18 @@ class _Reader:
         )
         held = self.equalities.held
         return joint.fix(held[number]) if number in held else joint
+
+    def _find_limits(self, number: int) -> tuple[float, float] | None:
+        """Return the limits of a joint relative to the file, as far as its leader reaches."""
+        limits = None
+        if self.model.jnt_limited[number]:
+            zero = float(self.model.qpos0[self.model.jnt_qposadr[number]])
+            low, high = (float(value) - zero for value in self.model.jnt_range[number])
+            limits = make_limits(low, high)
+        if number not in self.equalities.followers:
+            return limits
+        leader, factor, offset = self.equalities.followers[number]
+        return limit_follower(limits, self._find_limits(leader), factor, offset)
 
     def _read_inertia(self, body: int, frame: pin.SE3) -> pin.Inertia:
         """Return a body's inertia as stated, or as MuJoCo computes it from its geoms' densities."""

@@ -22,11 +22,14 @@ class Equalities:
     Attributes:
         held: Joint → position relative to that in the file, [rad] or [m], at which it is held.
         attached: Free body → body to which it is fixed.
+        followers: Leader, factor and offset of each joint that follows a moving one linearly, by
+            numbers of joints; no joint leads itself.
         notes: What was made of each equality.
     """
 
     held: dict[int, float] = field(default_factory=dict)
     attached: dict[int, int] = field(default_factory=dict)
+    followers: dict[int, tuple[int, float, float]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
 
@@ -137,9 +140,20 @@ def _hold_couplings(
         if len(moving) == len(left):
             break
         left = moving
-    for follower, leader, _ in left:
+    for follower, leader, (offset, factor, *higher) in left:
+        # Couplings in a circle limit nothing.
+        if not any(higher) and follower not in _walk_leaders(found, leader):
+            found.followers.setdefault(follower, (leader, factor, offset))
         names = f"joint '{_name_joint(model, follower)}' follows '{_name_joint(model, leader)}'"
         found.notes.append(f"{names} (<equality>): made independent")
+
+
+def _walk_leaders(found: Equalities, joint: int) -> Iterator[int]:
+    """Yield a joint and those that it follows."""
+    yield joint
+    while joint in found.followers:
+        joint = found.followers[joint][0]
+        yield joint
 
 
 def _name_body(model: Any, body: int) -> str:

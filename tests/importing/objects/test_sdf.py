@@ -606,3 +606,22 @@ def test_followers_keep_the_limits_that_their_leaders_reach(
     assert found["to_third"] == pytest.approx((-expected[1], -expected[0]))
     assert found["to_first"] == (0.0, 0.4)
     assert found["to_one"] == found["to_other"] == (0.0, 1.0)
+
+
+@pytest.mark.parametrize(("radius", "length"), [(0.1, 0.3), (0.4, 0.05), (0.02, 1.0)])
+def test_cones_stand_on_their_base(tmp_path: Path, radius: float, length: float) -> None:
+    cone = f"<cone><radius>{radius}</radius><length>{length}</length></cone>"
+    text = (
+        '<sdf version="1.11"><model name="m"><link name="l"><inertial auto="true"/>'
+        f'<collision name="c"><pose>1 0 0 0 0 0</pose><geometry>{cone}</geometry></collision>'
+        "</link></model></sdf>"
+    )
+    link = read_model(tmp_path, text).links["l"]
+    (part,) = link.collision
+    low, high = part.make_mesh().bounds
+    assert low == pytest.approx([1.0 - radius, -radius, -length / 2.0], abs=0.01 * radius)
+    assert high == pytest.approx([1.0 + radius, radius, length / 2.0], abs=0.01 * radius)
+    mass = 1000.0 * np.pi * radius**2 * length / 3.0
+    assert link.inertia.mass == pytest.approx(mass, rel=0.01)
+    # The centre of mass is at a quarter of the height above the base.
+    assert link.inertia.lever == pytest.approx([1.0, 0.0, -length / 4.0], abs=1e-6)

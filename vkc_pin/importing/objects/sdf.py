@@ -45,10 +45,12 @@ _MOMENT = 1.0  # [kg·m²] about each axis
 _DENSITY = 1000.0  # [kg/m³] of a shape whose inertia is computed
 _DIAGONAL = ("ixx", "iyy", "izz")
 _MOVING = ("revolute", "continuous", "prismatic")
+_SIDES = 48  # facets of a cone
 _JOINT_TYPES = ("fixed", *_MOVING, "ball", "universal", "revolute2", "screw", "gearbox")
 # Numbers of each shape: name of the element and count
 _SHAPES = {
     "box": (("size", 3),),
+    "cone": (("radius", 1), ("length", 1)),
     "sphere": (("radius", 1),),
     "cylinder": (("radius", 1), ("length", 1)),
     "capsule": (("radius", 1), ("length", 1)),
@@ -588,9 +590,15 @@ class _Reader:
             raise make_element_error(
                 scope.file, shape, problem, field=name, expected=expected, got=size
             )
-        if shape.tag == "ellipsoid":
-            import trimesh
+        import trimesh
 
+        if shape.tag == "cone":
+            radius, length = size
+            # Its frame is at half of its height, the tip on z.
+            cone = trimesh.creation.cone(radius, length, sections=_SIDES)
+            cone.apply_translation((0.0, 0.0, -0.5 * length))
+            return {"kind": "mesh", "size": (1.0, 1.0, 1.0), "triangles": cone}
+        if shape.tag == "ellipsoid":
             ball = trimesh.creation.icosphere(subdivisions=3)
             return {"kind": "mesh", "size": size, "triangles": ball}
         return {"kind": shape.tag, "size": size}

@@ -25,6 +25,14 @@ AHEAD = [
 SIDEWAYS = [
     format_wheel(name, x, -0.1, axis="1 0 0") for name, x in zip(WHEELS, (-0.3, 0.3), strict=True)
 ]
+OBLIQUE = [
+    format_wheel(name, 0.1 - 0.18 * side, 0.05 + 0.24 * side, axis="-0.6 0.8 0")
+    for name, side in zip(WHEELS, (1, -1), strict=True)
+]
+REVERSED = [
+    format_wheel(name, -0.3, y, axis="0 -1 0")
+    for name, y in zip(WHEELS, (-0.25, 0.25), strict=True)
+]
 CASTERS = [format_steered_wheel("caster_wheel", 0.2, 0.0, trail=0.05)]
 
 
@@ -51,8 +59,8 @@ def measure_slip(plan: vkc.Plan, robot: vkc.Robot) -> float:
 
 @pytest.mark.parametrize(
     "wheels",
-    [BEHIND, AHEAD, SIDEWAYS, [*BEHIND, *CASTERS]],
-    ids=["behind", "mirrored", "sideways", "casters"],
+    [BEHIND, AHEAD, SIDEWAYS, OBLIQUE, REVERSED, [*BEHIND, *CASTERS]],
+    ids=["behind", "mirrored", "sideways", "oblique", "reversed", "casters"],
 )
 def test_wheels_roll_without_sliding(tmp_path: Path, wheels: list[str]) -> None:
     imported = import_wheeled(tmp_path, *wheels)

@@ -154,7 +154,7 @@ def test_grasped_object_adds_its_shapes_to_the_base() -> None:
     scene = make_room(objects=["stick"])
     held = scene.with_held({"stick": "grip"})
     shapes = [
-        len(BasePaths(make_drive(one, 1.0, 1.0), whole=True).grid.base.shapes)
+        len(BasePaths(make_drive(one, 1.0, 1.0), whole=True).grid.base.solids)
         for one in (scene, held)
     ]
     assert shapes[1] == shapes[0] + len(scene.objects["stick"].object.collision.geometryObjects)

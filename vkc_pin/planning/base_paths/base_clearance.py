@@ -77,7 +77,7 @@ class MovingShapes:
 
     def __init__(self, shapes: Sequence[Shape], world: Obstacles, margin: float) -> None:
         self.world, self.margin = world, margin
-        self._solids = [(convert_solid(shape), placement) for shape, placement in shapes]
+        self.solids = [(convert_solid(shape), placement) for shape, placement in shapes]
         outlines = [compute_hull_points(*placed, outer=True) for placed in shapes]
         radius = np.array([radius for _, radius in outlines])
         low = np.array([points[:, 2].min() for points, _ in outlines]) - radius
@@ -246,7 +246,7 @@ class MovingShapes:
 
     def _compute_distance(self, row: int, at: Floats, yaw: float) -> tuple[float, Floats]:
         """Return the distance of a pair at a base pose [m], and its normal in the plane, (2,)."""
-        solid, placement = self._solids[self.moving[row]]
+        solid, placement = self.solids[self.moving[row]]
         cosine, sine = math.cos(yaw), math.sin(yaw)
         turned = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
         moved = pin.SE3(turned, np.array([at[0], at[1], 0.0])) * placement

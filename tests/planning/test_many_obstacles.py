@@ -48,11 +48,19 @@ def compute_all_distances(
     data, placed = model.createData(), pin.GeometryData(geometry)
     for request in placed.distanceRequests:
         request.gjk_tolerance = 1e-8
+    pairs = [(pair.first, pair.second) for pair in geometry.collisionPairs]
+    shapes = [shape.geometry for shape in geometry.geometryObjects]
     distances = np.empty((len(z), len(geometry.collisionPairs)))
     for row, q in enumerate(problem.chain.coordinates.q(z)):
         pin.updateGeometryPlacements(model, data, geometry, placed, q)
         pin.computeDistances(geometry, placed)
         distances[row] = [result.min_distance for result in placed.distanceResults]
+        # Pinocchio's are coal's, which are wrong for some round shapes that overlap.
+        for k in np.flatnonzero(distances[row] <= 0.0).tolist():
+            i, j = pairs[k]
+            distances[row, k] = compute_shape_distance(
+                shapes[i], placed.oMg[i], shapes[j], placed.oMg[j]
+            )
     return distances
 
 

@@ -71,6 +71,7 @@ class MovingShapes:
     """Shapes that move with the base, and their pairs with obstacles at the same height.
 
     Attributes:
+        solids: Results of `convert_solid`, and placements on the base.
         exclusion_radius: Distance from each obstacle beyond which no heading collides with it;
             -inf if no shape shares its height, shape (S,) [m].
     """

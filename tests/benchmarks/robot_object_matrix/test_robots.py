@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from helpers.arm_urdf import write_arms
 from helpers.experiments import run_experiment
+from helpers.wheels import format_wheel, write_wheeled_robot
 
 import vkc_pin as vkc
 from vkc_pin.benchmarks.harness.record import describe_environment
@@ -54,15 +55,28 @@ def test_command_records_reached_poses_and_a_failed_import(tmp_path: Path) -> No
     assert all(r["base_path_length"] + r["arm_path_length"] > 0.1 for r in reached)
     assert reached[0]["home_room"] >= 0.03
     assert reached[0]["joints"] == 5
+    assert reached[0]["base"] == "omni"
+    assert "| robot | omni | 5 |" in table
     assert reached[0]["load_time"] > 0.0
     assert "no arm was found" in table
     assert "| 2/2 |" in table
     assert vkc.load_robot(out / "robots" / "robot").home.tolist() != []
 
 
+@pytest.mark.long
+def test_robot_with_unsteered_wheels_does_not_slide(tmp_path: Path) -> None:
+    wheels = (format_wheel("left_wheel", 0.0, 0.25), format_wheel("right_wheel", 0.0, -0.25))
+    file = write_wheeled_robot(tmp_path / "rover", *wheels)
+    out = tmp_path / "out"
+    table, records = run_experiment(f"robots --goals 1 --robots {file}", out)
+    assert [(r["base"], r["success"]) for r in records] == [("differential", True)]
+    assert "| robot | differential | 5 |" in table
+
+
 def test_report_lists_failures_by_robot() -> None:
     meta = describe_environment(robots=["one", "two"], goals=2, seed=0, time_limit=5.0)
     facts = {"import_time": 4.0, "load_time": 0.5, "joints": 6, "pairs": 7, "home_room": -0.004}
+    facts |= {"base": "ackermann"}
     failed = {**facts, "success": False}
     infeasible = {"status": "infeasible", "planning_time": 3.0, "violations": ["too deep"]}
     unplanned = {"home_room": None, "status": "hardly free", "because": "only 1 of 9"}
@@ -72,7 +86,7 @@ def test_report_lists_failures_by_robot() -> None:
         {"robot": "two", **failed, **unplanned},
     ]
     text = format_results({"meta": meta, "trials": trials})
-    assert "| one | 6 | 7 | 4.00 | 0.50 | -4 | 1/2 | 2.00 | 2.90 |" in text
-    assert "| two | 6 | 7 | 4.00 | 0.50 | – | – |" in text
+    assert "| one | ackermann | 6 | 7 | 4.00 | 0.50 | -4 | 1/2 | 2.00 | 2.90 |" in text
+    assert "| two | ackermann | 6 | 7 | 4.00 | 0.50 | – | – |" in text
     assert "| one | infeasible | too deep |" in text
     assert "| two | hardly free | only 1 of 9 |" in text

@@ -17,7 +17,7 @@ from vkc_pin.benchmarks.robot_object_matrix.run import chart, format_results
 def make_record(robot: str, name: str, status: str = "success", **fields: Any) -> dict[str, Any]:
     record = {"robot": robot, "object": name, "success": status == "success", "status": status}
     if status not in ("unreachable", "error", "no hand"):
-        record |= {"planning_time": 1.0, "load_time": 0.5}
+        record |= {"planning_time": 1.0, "load_time": 0.5, "base": "omni"}
     return {**record, **fields}
 
 
@@ -46,15 +46,17 @@ def test_tables_list_all_pairs() -> None:
     )
     assert "3 robots, 3 objects of 3 kinds, 2 random starts each" in text
     assert "A joint is opened by 50% of its range" in text
-    assert "| one | 3 | 2 | 1 (50%) | 2 (100%) | 1.00 | 2.70 | 0.50 |" in text
-    assert "| two | 3 | 2 | 0 (0%) | 0 (0%) | 1.00 | 1.00 | 0.50 |" in text, "an error is a failure"
-    assert "| all | 9 | 4 | 1 (25%) | 2 (50%) |" in text
+    assert "| one | omni | 3 | 2 | 1 (50%) | 2 (100%) | 1.00 | 2.70 | 0.50 |" in text
+    assert "| two | omni | 3 | 2 | 0 (0%) | 0 (0%) | 1.00 | 1.00 | 0.50 |" in text, (
+        "an error is a failure"
+    )
+    assert "| all | omni | 9 | 4 | 1 (25%) | 2 (50%) |" in text
     assert "| oven_0 | 2/2 | 0/2 | – |\n| door | 1/2 | ! | – |\n| valve_1 | – | – | – |" in text
     assert "| one | door | infeasible | 1 | the shelf \\| the wall |" in text
     assert "| two | oven_0 | not converged | 2 |  |" in text, "equal failures share a row"
     assert "| two | door | error | 1 | InputError: no |" in text
     assert "| three | every object | no hand | 3 | touch_links: not known |" in text
-    assert "| three | 3 | 0 | 0 (0%) | 0 (0%) | – | – | – |" in text
+    assert "| three | – | 3 | 0 | 0 (0%) | 0 (0%) | – | – | – |" in text
     assert (
         text.index("## What failed")
         < text.index("## Out of reach")
@@ -78,6 +80,8 @@ def test_command_opens_a_drawer(tmp_path: Path) -> None:
     arguments = "anything --starts 1 --robots husky_ur5e --objects drawers_0"
     table, (opened,) = run_experiment(arguments, tmp_path)
     assert "| drawers_0 | 1/1 |" in table
+    assert "| husky_ur5e | omni | 1 | 1 |" in table
+    assert opened["base"] == "omni"
     assert (tmp_path / "success.png").stat().st_size > 5000
     assert (opened["success"], opened["violations"], opened["kind"]) == (True, [], "drawers")
     reach = (drawers.upper - drawers.lower)[drawers.coordinates.index(opened["joint"])]

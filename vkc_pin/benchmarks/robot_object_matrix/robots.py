@@ -34,7 +34,7 @@ from vkc_pin.world.files.writing import check_name
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import list_robots, load_robot
 from vkc_pin.world.models.self_collisions import set_collision_pairs
-from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.scene.scene import load_scene
 from vkc_pin.world.task.steps import Reach
 
 __all__ = ["ROBOTS", "format_results", "run", "sample_reachable_poses"]
@@ -72,6 +72,7 @@ _NOT_IMPORTED = ("not imported", "hardly free")
 _HEAD = (
     *(
         "robot",
+        "base",
         "planned joints",
         "pairs",
         "import [s]",
@@ -186,17 +187,19 @@ def format_results(result: Mapping[str, Any]) -> str:
         for r in records
         if not r["success"]
     ]
+    rows = [_row(name, select(records, robot=name)) for name in about["robots"]]
     section = ["## What failed", format_table(("robot", "status", "because"), failed, text=3)]
     return join_sections(
         about,
         "# Robots",
-        "Robots are imported from their makers' files alone; each then reaches "
+        "Robots are imported from their makers' files alone; each then reaches, on the base that "
+        "the import assumes, "
         f"{about['goals']} random poses of free configurations, seed {about['seed']}, "
         f"{describe_limit(about)} each. {JUDGED} Importing, and loading again in a new process, "
         "are in "
         "processor time. Clearance at home is the least distance between links that are not "
         "neighbours, and of the arm to the floor.",
-        format_table(_HEAD, [_row(name, select(records, robot=name)) for name in about["robots"]]),
+        format_table(_HEAD, rows, text=2),
         *(section if failed else []),
     )
 
@@ -212,7 +215,8 @@ def _row(name: str, own: Sequence[Record]) -> list[str]:
     room = (
         "–" if first["home_room"] is None else f"{1e3 * first['home_room']:.0f}"
     )  # nothing that could come close
-    return [name, str(first["joints"]), str(first["pairs"]), *loads, room, reached, *times]
+    counts = [str(first["joints"]), str(first["pairs"])]
+    return [name, str(first["base"]), *counts, *loads, room, reached, *times]
 
 
 def _files(robots: Sequence[str]) -> dict[str, Path]:
@@ -271,7 +275,8 @@ def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:
                     "because": because,
                 }
             ]
-        about |= _facts(imported.robot, folder)
+        scene = load_scene(folder / "scene.yaml")
+        about |= {"base": scene.robot.base, **_facts(imported.robot, folder)}
         try:
             poses = sample_reachable_poses(imported.robot, name, spec["goals"], seed=seed)
         except VkcError as error:
@@ -284,12 +289,7 @@ def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:
                     "because": str(error),
                 }
             ]
-        document = {
-            "name": f"{name}_reach",
-            "robot": str(folder.resolve()),
-            "start": {"base": [0.0, 0.0, 0.0]},
-        }
-        scene, records = Scene.from_document(document), []
+        records = []
         for number, pose in enumerate(poses):
             one = plan(scene, [Reach(pose)], seed=seed, **LIMITS)
             because = "; ".join(one.report.notes)

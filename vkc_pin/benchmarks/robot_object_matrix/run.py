@@ -42,6 +42,7 @@ __all__ = ["chart", "format_results", "run"]
 
 _SUMMARY = (
     "robot",
+    "base",
     "combinations",
     "reachable",
     "open from all starts",
@@ -71,7 +72,7 @@ def format_results(result: Mapping[str, Any]) -> str:
         "object is within reach if the hand gets to it both closed and open by so much. "
         f"{JUDGED} Times are those of all plans; loading again is the median over all "
         "combinations of a robot.",
-        format_table(_SUMMARY, [_summary(robot, groups) for robot in (*robots, _ALL)]),
+        format_table(_SUMMARY, [_summary(robot, groups) for robot in (*robots, _ALL)], text=2),
         "## Every combination",
         "How many starts succeed; – is out of reach, ! could not be tried.",
         format_table(["object", *robots], rows),
@@ -133,7 +134,8 @@ def _summary(robot: str, groups: Mapping[tuple[str, str], Sequence[Record]]) -> 
     chosen = [own for key, own in groups.items() if robot in (key[0], _ALL)]
     reached = [own for own in chosen if all(map(_is_reached, own))]
     flat = [record for own in chosen for record in own]
-    cells = [robot, str(len(chosen)), str(len(reached))]
+    bases = dict.fromkeys(str(r["base"]) for r in flat if "base" in r)
+    cells = [robot, ", ".join(bases) or "–", str(len(chosen)), str(len(reached))]
     for judge in (all, any):
         good = sum(judge(record["success"] for record in own) for own in reached)
         cells.append(f"{good} ({good / max(len(reached), 1):.0%})")
@@ -221,7 +223,7 @@ def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:
         warnings.simplefilter("ignore")  # warnings about a robot would repeat for every object
         began = time.perf_counter()
         robot = load_robot(file)
-        about["load_time"] = time.perf_counter() - began
+        about |= {"load_time": time.perf_counter() - began, "base": robot.base}
         began = time.perf_counter()
         found = make_pair(robot, file, object_file, seed=seed)
         about["look_time"] = time.perf_counter() - began

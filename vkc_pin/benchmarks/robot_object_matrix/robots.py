@@ -216,7 +216,7 @@ def _row(name: str, own: Sequence[Record]) -> list[str]:
         "–" if first["home_room"] is None else f"{1e3 * first['home_room']:.0f}"
     )  # nothing that could come close
     counts = [str(first["joints"]), str(first["pairs"])]
-    return [name, str(first["base"]), *counts, *loads, room, reached, *times]
+    return [name, first["base"], *counts, *loads, room, reached, *times]
 
 
 def _files(robots: Sequence[str]) -> dict[str, Path]:

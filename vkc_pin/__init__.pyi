@@ -13,6 +13,7 @@ from . import (
 from .errors import BuildError, InputError, UnknownNameError, VkcError
 from .options import Options
 from .planning.chain.chain import VirtualKinematicChain, consolidate, invert
+from .planning.inverse_kinematics import inverse_kinematics
 from .planning.nlp.inspection import build
 from .planning.nlp.problem import TrajectoryProblem
 from .planning.plan import Plan
@@ -31,7 +32,7 @@ from .world.models.robot_file import load_robot
 from .world.scene.hold import Hold
 from .world.scene.placed_object import PlacedObject
 from .world.scene.scene import Scene, load_scene
-from .world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Touch
+from .world.task.steps import Actuate, Configure, GoTo, Grasp, Place, Reach, Release, Touch
 from .world.task.terms import Constraint, Cost, State
 from .world.trajectory.phase_span import PhaseSpan
 from .world.trajectory.trajectory import Trajectory
@@ -44,6 +45,7 @@ __all__ = [
     "ArticulatedObject",
     "Attachment",
     "BuildError",
+    "Configure",
     "Constraint",
     "Cost",
     "Freedom",
@@ -86,6 +88,7 @@ __all__ = [
     "cpin",
     "datasets",
     "importing",
+    "inverse_kinematics",
     "invert",
     "load_object",
     "load_robot",

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from helpers.commands import RunCommand
+from helpers.expected_errors import expect_error
 
 import vkc_pin as vkc
 from vkc_pin.cli.commands import make_parser
@@ -63,6 +64,27 @@ def test_steps_of_all_kinds_keep_their_order() -> None:
         vkc.Reach(POSE),
         vkc.Actuate("door", {"hinge": 1.0}),
     )
+
+
+def test_joints_of_the_robot_are_set_together() -> None:
+    words = "--joint elbow=1 --joint base_x=-0.5 --then --joint elbow=2 --joint elbow=3"
+    assert parse_steps(words) == list_data(
+        vkc.Configure({"elbow": 1.0, "base_x": -0.5}),
+        vkc.Configure({"elbow": 2.0}),
+        vkc.Configure({"elbow": 3.0}),
+    )
+    for wrong, problem in (("elbow", "not a setting"), ("elbow=far", "not a number after '='")):
+        with expect_error(problem, field="--joint"):
+            parse_steps(f"--joint {wrong}")
+
+
+def test_a_joint_goal_is_planned_from_the_command_line(run: RunCommand) -> None:
+    result = run("plan drawer --joint elbow_joint=1 --save plan.npz --quiet")
+    assert result.code == 0, result.err
+    assert vkc.Plan.load("plan.npz").steps == (vkc.Configure({"elbow_joint": 1.0}),)
+    result = run("plan drawer --joint elbow=1")
+    assert result.code == 2
+    assert "did you mean 'elbow_joint'" in result.err
 
 
 def test_an_object_is_grasped_from_the_command_line(run: RunCommand) -> None:

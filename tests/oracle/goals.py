@@ -88,6 +88,17 @@ def _compute_errors(
                 else ANGLE_TOLERANCE
             )
             yield name, abs(end.get_value(name) - goal), limit, "value"
+    elif kind == "Configure":
+        for joint, goal in step["joints"].items():
+            position, is_angle, is_endless = _find_joint_position(world, joint, end)
+            error = position - goal
+            if is_endless:
+                error = (error + np.pi) % (2 * np.pi) - np.pi
+            deviation = step["tolerance"]
+            if isinstance(deviation, dict):
+                deviation = deviation.get(joint, 0.0)
+            limit = ANGLE_TOLERANCE if is_angle else POSITION_TOLERANCE
+            yield joint, abs(error), limit + deviation, "joint"
     elif kind == "GoTo":
         x, y = end.get_value("base_x") - step["x"], end.get_value("base_y") - step["y"]
         yield "base", float(np.hypot(x, y)), POSITION_TOLERANCE, "place"
@@ -96,6 +107,18 @@ def _compute_errors(
             yield "base heading", error, ANGLE_TOLERANCE, "heading"
     elif kind in ("Reach", "Touch", "Place"):
         yield from _compute_pose_errors(world, step, end)
+
+
+def _find_joint_position(world: World, joint: str, end: End) -> tuple[float, bool, bool]:
+    """Return the position of a joint of the robot, whether it turns, and whether without limits."""
+    robot = world.robot
+    leader, factor, offset = robot.coupled.get(joint, (joint, 1.0, 0.0))
+    if joint.startswith("base_"):
+        is_angle = joint == "base_yaw"
+    else:
+        is_angle = robot.tree.urdf.joints[joint].get("type") != "prismatic"
+    is_endless = is_angle and bool(np.isinf(robot.limits[leader][1]))
+    return factor * end.get_value(leader) + offset, is_angle, is_endless
 
 
 def _compute_pose_errors(

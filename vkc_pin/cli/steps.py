@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 __all__ = ["add_steps", "make_steps", "parse_settings"]
 
 _SETTING = "OBJECT.JOINT=VALUE, e.g. door.hinge=1.2"
+_JOINT = "NAME=VALUE, e.g. elbow_joint=1.2"
 _THEN = "--then"
 _OPTIONS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("--set OBJECT.JOINT=VALUE", "bring a joint to a value [m], [rad]", {}),
@@ -40,7 +42,8 @@ _OPTIONS: tuple[tuple[str, str, dict[str, Any]], ...] = (
         "drive the base to a place [m], [rad]",
         {"nargs": 3, "type": float, "metavar": ("X", "Y", "YAW")},
     ),
-    (_THEN, "begin a new step: settings of one object before and after it are two steps", {}),
+    ("--joint NAME=VALUE", "bring a joint of the robot to a value [m], [rad]", {}),
+    (_THEN, "begin a new step: settings before and after it are two steps", {}),
 )
 
 
@@ -64,22 +67,21 @@ class _AppendStep(argparse.Action):
 def make_steps(given: Sequence[tuple[str, Any]]) -> list[Step]:
     """Return the steps of options and their values, in this order.
 
-    Consecutive settings of different joints of one object become one step; `--then` separates them.
+    Consecutive settings of different joints of one object, or of the robot, become one step;
+    `--then` separates them.
 
     Raises:
         InputError: There are none, or a value has another form.
     """
     steps = list[Any]()
-    settings = list[str]()
-    for option, values in given:
+    for option, group in itertools.groupby(given, key=lambda one: one[0]):
+        values = [value for _, value in group]
         if option == "--set":
-            settings.append(values)
-            continue
-        steps += parse_settings(settings)
-        settings = []
-        if option != _THEN:
-            steps.append(_MAKERS[option](values))
-    steps += parse_settings(settings)
+            steps += parse_settings(values)
+        elif option == "--joint":
+            steps += _parse_joints(values)
+        elif option != _THEN:
+            steps += [_MAKERS[option](value) for value in values]
     if not steps:
         expected = ", ".join(form.partition(" ")[0] for form, _, _ in _OPTIONS[:-1])
         raise InputError("nothing to plan", field="plan", expected=f"one of {expected}")
@@ -110,11 +112,29 @@ def parse_settings(settings: Sequence[str]) -> list[Step]:
     return [Actuate(owner, joints) for owner, joints in grouped]
 
 
+def _parse_joints(settings: Sequence[str]) -> list[Step]:
+    """Return `Configure` steps of texts "joint=value"; a repeated joint begins a new step."""
+    from vkc_pin.world.task.steps import Configure
+
+    grouped = list[dict[str, float]]()
+    for text in settings:
+        joint, equals, value = text.partition("=")
+        joint = joint.strip()
+        if not (equals and joint):
+            raise InputError("not a setting", field="--joint", expected=_JOINT, got=repr(text))
+        number = _parse_number(value, "--joint", _JOINT, text)
+        if not grouped or joint in grouped[-1]:
+            grouped.append({})
+        grouped[-1][joint] = number
+    return [Configure(joints) for joints in grouped]
+
+
 def _parse_number(text: str, field: str, expected: str, whole: str) -> float:
     try:
         return float(text)
     except ValueError:
-        problem = "not a number after '='" if field == "--set" else "not a number"
+        is_setting = field in ("--set", "--joint")
+        problem = "not a number after '='" if is_setting else "not a number"
         raise InputError(problem, field=field, expected=expected, got=repr(whole)) from None
 
 
@@ -156,7 +176,7 @@ def _make_release(value: str) -> Step:
 def _make_reach(pose: Sequence[float]) -> Step:
     from vkc_pin.world.task.steps import Reach
 
-    return Reach(pose)
+    return Reach(tuple(pose))
 
 
 def _make_drive(place: Sequence[float]) -> Step:

@@ -124,7 +124,7 @@ def plan(  # noqa: PLR0913 - keyword options of a public call
     Args:
         scene: Robot, objects and obstacles; the trajectory starts at the scene's start.
         steps: What should change in the world, in this order: `Reach`, `Grasp`, `Actuate`, `Touch`,
-            `Place`, `Release`, `GoTo`.
+            `Place`, `Release`, `GoTo`, `Configure`.
         initialization: Initialization method: "auto", "interpolated", "astar", "rrt" or
             "stationary".
         options: Options of planning; `Options()` by default.

@@ -20,7 +20,17 @@ from vkc_pin.world.scene.hold import (
     measure_deviation,
 )
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
+from vkc_pin.world.task.steps import (
+    Actuate,
+    Configure,
+    GoTo,
+    Grasp,
+    Place,
+    Reach,
+    Release,
+    Step,
+    Touch,
+)
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
@@ -206,6 +216,15 @@ def _compute_goal_errors(world: World, scene: Scene, step: Step, row: Floats) ->
         for joint, goal in step.joints.items():
             column = names.index(f"{step.object}.{joint}")
             yield names[column], abs(float(row[column]) - goal), units[column]
+    elif isinstance(step, Configure):
+        robot = world.scene.robot
+        for joint, goal in step.joints.items():
+            move = robot.planned_joints[joint]
+            error = move.factor * float(row[move.coordinate]) + move.offset - goal
+            if robot.is_periodic(move.coordinate):
+                error = float(wrap_angle(error))
+            beyond = max(abs(error) - step.get_tolerance(joint), 0.0)
+            yield joint, beyond, "m" if move.slides else "rad"
     elif isinstance(step, GoTo):
         yield "base", float(np.hypot(row[0] - step.x, row[1] - step.y)), "m"
         if step.yaw is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,17 @@ from vkc_pin.validation.tolerances import Tolerances
 from vkc_pin.world.models.coordinates import wrap_angle
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Step, Touch
+from vkc_pin.world.task.steps import (
+    Actuate,
+    Configure,
+    GoTo,
+    Grasp,
+    Place,
+    Reach,
+    Release,
+    Step,
+    Touch,
+)
 
 __all__ = ["check_goals", "check_steps", "find_grasped_objects", "make_hold"]
 
@@ -45,6 +55,10 @@ def check_steps(samples: Samples, steps: Sequence[Step]) -> None:
         elif isinstance(step, Touch) and step.frame.partition(".")[0] in samples.scene.objects:
             samples.check_frame(step.frame, f"{where}.frame")
             _check_attachment(samples, step.frame.partition(".")[0], step.attachment, where)
+        elif isinstance(step, Configure):
+            joints = samples.scene.robot.planned_joints
+            for joint in step.joints:
+                check_choice(joint, joints, "joint of the robot", f"{where}.joints")
         elif isinstance(step, Reach | Touch) and step.frame is not None:
             frames = samples.scene.robot.frame_names
             check_choice(step.frame, frames, "frame of the robot", f"{where}.frame")
@@ -234,56 +248,69 @@ def _compute_goal_errors(
 ) -> list[GoalError]:
     """Return the unmet parts of a step's goal after `end` phases."""
     phases = samples.trajectory.phases
-    row, misses = int(samples.waypoint_rows[phases[end - 1].last if end else 0]), []
-    held = phases[min(end, len(phases) - 1)].held  # grasps of the next phase
+    row = int(samples.waypoint_rows[phases[end - 1].last if end else 0])
     tolerance = {"m": tolerances.goal_position, "rad": tolerances.goal_angle}
-
-    def expect(subject: str, error: float, unit: str, detail: str) -> None:
+    misses = list[GoalError]()
+    for subject, error, unit, detail in _compute_errors(samples, step, end, row):
         if not error <= tolerance[unit]:
             misses.append(GoalError(subject, error - tolerance[unit], unit, detail))
+    if isinstance(step, Place | Release):
+        held = phases[min(end, len(phases) - 1)].held  # grasps of the next phase
+        for name in [step.object] if step.object is not None else list(held):
+            if name in held:
+                misses.append(GoalError(name, 1.0, "holds", "is still grasped"))
+    return misses
 
+
+def _compute_errors(samples: Samples, step: Step, end: int, row: int) -> Iterator[GoalError]:
+    """Yield how far everything that a step sets is from its goal in a row, after `end` phases."""
     if isinstance(step, Actuate):
         for joint, goal in step.joints.items():
             name = f"{step.object}.{joint}"
-            value, unit = (
-                float(samples.z[row, samples.world.coordinates.index(name)]),
-                samples.get_unit(name),
-            )
-            expect(
-                name, abs(value - goal), unit, f"{value:.4f} {unit} instead of {goal:.4f} {unit}"
-            )
+            value = float(samples.z[row, samples.world.coordinates.index(name)])
+            unit = samples.get_unit(name)
+            detail = f"{value:.4f} {unit} instead of {goal:.4f} {unit}"
+            yield GoalError(name, abs(value - goal), unit, detail)
+    elif isinstance(step, Configure):
+        yield from _compute_joint_errors(samples, step, row)
     elif isinstance(step, Grasp):
+        phases = samples.trajectory.phases
         near = phases[max(end - 1, 0) : end + 1]  # those that end or begin here
         holds = [hold for phase in near for hold in phase.holds if hold.frame == step.by]
-        name, (distance, turn) = _find_closest_grasp(samples, step, row, holds)
-        expect(
-            f"{step.object}.{name}", distance, "m", f"the tool is {distance:.4f} m from the grasp"
-        )
-        expect(
-            f"{step.object}.{name}",
-            turn,
-            "rad",
-            f"the tool is turned {turn:.4f} rad from the grasp",
-        )
+        attachment, (distance, turn) = _find_closest_grasp(samples, step, row, holds)
+        name = f"{step.object}.{attachment}"
+        yield GoalError(name, distance, "m", f"the tool is {distance:.4f} m from the grasp")
+        yield GoalError(name, turn, "rad", f"the tool is turned {turn:.4f} rad from the grasp")
     elif isinstance(step, Reach | Touch | Place):
         frame, target, free = _get_target(samples, step)
         placement = samples.compute_placements([row], frame)[0]
         distance = float(np.linalg.norm(placement.translation - target.translation))
-        expect(frame, distance, "m", f"{distance:.4f} m from its target")
+        yield GoalError(frame, distance, "m", f"{distance:.4f} m from its target")
         turn = _compute_angle_error(placement, target, free)
-        expect(frame, turn, "rad", f"turned {turn:.4f} rad from its target orientation")
-    if isinstance(step, Place | Release):
-        for name in [step.object] if step.object is not None else list(held):
-            if name in held:
-                misses.append(GoalError(name, 1.0, "holds", "is still grasped"))
-    if isinstance(step, GoTo):
+        detail = f"turned {turn:.4f} rad from its target orientation"
+        yield GoalError(frame, turn, "rad", detail)
+    elif isinstance(step, GoTo):
         x, y, yaw = samples.z[row, :3]
         distance = float(np.hypot(x - step.x, y - step.y))
-        expect("base", distance, "m", f"{distance:.4f} m from its target")
+        yield GoalError("base", distance, "m", f"{distance:.4f} m from its target")
         if step.yaw is not None:
             turn = float(abs(wrap_angle(yaw - step.yaw)))
-            expect("base heading", turn, "rad", f"turned {turn:.4f} rad from its target heading")
-    return misses
+            detail = f"turned {turn:.4f} rad from its target heading"
+            yield GoalError("base heading", turn, "rad", detail)
+
+
+def _compute_joint_errors(samples: Samples, step: Configure, row: int) -> Iterator[GoalError]:
+    """Yield how far each joint of a step is outside its tolerance."""
+    robot = samples.scene.robot
+    for joint, goal in step.joints.items():
+        move = robot.planned_joints[joint]
+        value = move.factor * float(samples.z[row, move.coordinate]) + move.offset
+        error = value - goal
+        if robot.is_periodic(move.coordinate):
+            error = float(wrap_angle(error))
+        unit = "m" if move.slides else "rad"
+        detail = f"{value:.4f} {unit} instead of {goal:.4f} {unit}"
+        yield GoalError(joint, abs(error) - step.get_tolerance(joint), unit, detail)
 
 
 def _get_target(samples: Samples, step: Reach | Touch | Place) -> tuple[str, pin.SE3, str]:

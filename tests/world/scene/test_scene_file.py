@@ -126,7 +126,9 @@ SIZE, BASE = "size: [0.5, 0.4, 0.3]", "base: [0.0, 0.0, 0.5]"
         (BASE, "base: [9.0, 0.0, 0.5]", 3, "start.base[0]", "expected x from -4 to 4, got 9.0"),
         (f"  {BASE}\n", "", 2, "start.base", "missing"),
         ("arm: home", "arm: [0, 0, 0]", 4, "start.arm", "wrong number of arm joints"),
-        ("arm: home", "arm: rest", 4, "start.arm", "expected home, or a list of joint values"),
+        ("arm: home", "arm: {elbow: 1}", 4, "start.arm.elbow", "did you mean 'elbow_joint'?"),
+        ("arm: home", "arm: {elbow_joint: 9}", 4, "start.arm.elbow_joint", "3.14159, got 9"),
+        ("arm: home", "arm: rest", 4, "start.arm", "expected home, a list of joint values"),
         ("x: [-1, 1], y", "x: [1, -1], y", 5, "start_region.x", "expected [lowest, highest]"),
         ("x: [-1, 1], y", "x: [-9, 1], y", 5, "start_region.x", "expected x from -4 to 4"),
         ("yaw: any", "yaw: north", 5, "start_region.yaw", "expected any, or [lowest, highest]"),
@@ -240,6 +242,14 @@ def test_missing_files_are_reported(tmp_path: Path) -> None:
         (tmp_path / name).touch()
     with expect_error(rf"a file in {tmp_path}, perhaps dor\.yaml, got door\.yaml"):
         load_scene_text(tmp_path, TINY.replace("type: door", "type: door.yaml"))
+
+
+def test_start_may_name_some_joints(tmp_path: Path) -> None:
+    """The others are at home."""
+    scene = load_scene_text(tmp_path, TINY.replace("arm: home", "arm: {elbow_joint: 1.25}"))
+    arm = dict(zip(scene.robot.coordinates.names[3:], scene.start[3:], strict=True))
+    home = dict(zip(scene.robot.coordinates.names[3:], scene.robot.home, strict=True))
+    assert arm == {**home, "elbow_joint": 1.25}
 
 
 def test_start_may_have_a_height(tmp_path: Path) -> None:

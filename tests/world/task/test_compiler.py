@@ -70,7 +70,7 @@ def test_opening_a_door_has_three_phases() -> None:
     assert move.values == {"door.hinge": 1.2, "door.knob": TURNED}
     assert reach.initial_values == turn.initial_values == SHUT
     assert move.initial_values == {**SHUT, "door.knob": TURNED}
-    assert all(phase.base is None and phase.frames == () for phase in task.phases)
+    assert all(not phase.configuration and phase.frames == () for phase in task.phases)
 
 
 def test_latch_is_turned_only_if_it_is_engaged() -> None:
@@ -144,9 +144,14 @@ def test_go_to_releases_fixed_objects() -> None:
     task = compile_steps([OPEN, GoTo(1.0, 2.0, 0.3)])
     last = task.phases[-1]
     assert (last.name, last.held, last.released) == ("go to", (), (HANDLE,))
-    assert last.base == (1.0, 2.0, 0.3)
+    assert last.configuration == {
+        "base_x": (1.0, 1.0),
+        "base_y": (2.0, 2.0),
+        "base_yaw": (0.3, 0.3),
+    }
     assert last.initial_values == {"door.hinge": 1.2, "door.knob": TURNED}
-    assert compile_steps([GoTo(1.0, 2.0)]).phases[0].base == (1.0, 2.0, None)
+    anywhere = compile_steps([GoTo(1.0, 2.0)]).phases[0]
+    assert anywhere.configuration == {"base_x": (1.0, 1.0), "base_y": (2.0, 2.0)}
     held = load_door_scene().with_held({"door": "handle"})
     assert compile_steps([GoTo(1.0, 2.0)], held).phases[0].released == (HANDLE,)
 

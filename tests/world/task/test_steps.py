@@ -13,6 +13,7 @@ from helpers.expected_errors import expect_error
 
 from vkc_pin.world.task.steps import (
     Actuate,
+    Configure,
     GoTo,
     Grasp,
     Place,
@@ -48,6 +49,23 @@ def test_poses_and_points_are_copied() -> None:
 def test_invalid_joints_are_rejected(joints: Any, field: str) -> None:
     with expect_error(field=field):
         Actuate("door", joints)
+
+
+@pytest.mark.parametrize(
+    ("joints", "tolerance", "field"),
+    [
+        ({}, 0.0, "Configure.joints"),
+        ([1.0, 2.0], 0.0, "Configure.joints"),
+        ({"elbow": np.nan}, 0.0, "Configure.joints['elbow']"),
+        ({"elbow": 1.0}, -0.1, "Configure.tolerance"),
+        ({"elbow": 1.0}, np.inf, "Configure.tolerance"),
+        ({"elbow": 1.0}, {"elbow": -0.1}, "Configure.tolerance['elbow']"),
+        ({"elbow": 1.0}, {"elbo": 0.1}, "Configure.tolerance"),
+    ],
+)
+def test_invalid_joint_goals_are_rejected(joints: Any, tolerance: Any, field: str) -> None:
+    with expect_error(field=field):
+        Configure(joints, tolerance)
 
 
 @pytest.mark.parametrize(
@@ -90,6 +108,8 @@ def test_numbers_are_converted_to_floats() -> None:
         Release(),
         Actuate("door", {"hinge": 1.2, "knob": 0.1}, "handle"),
         GoTo(1.0, -2.0),
+        Configure({"elbow_joint": 1.2, "base_x": 0.5}, 0.1),
+        Configure({"elbow_joint": 1.2}, {"elbow_joint": 0.1}),
     ],
 )
 def test_steps_survive_a_round_trip_through_data(step: Step) -> None:

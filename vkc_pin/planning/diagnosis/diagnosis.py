@@ -20,6 +20,7 @@ from vkc_pin.validation.tolerances import Tolerances
 from vkc_pin.world.models.shapes import LIMIT_SLACK
 from vkc_pin.world.scene.clearance_exemptions import ACCEPTED_SHORTFALL
 from vkc_pin.world.scene.contact_rules import CONTACT_DEPTH
+from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.task.steps import Actuate
 
 __all__ = [
@@ -32,6 +33,7 @@ __all__ = [
 
 _MAX_BATCHES = 4  # batches of `SAMPLE_COUNT` random configurations before a goal counts as blocked
 _DEEP_SHORTFALL = 0.05  # [m], [rad] above which the solver cannot repair a goal configuration
+_BASE = 1  # the joint of the model that is the base
 _BISECTIONS = 5  # of the motion of an object joint, with one batch each: 1 s or less
 
 
@@ -89,11 +91,12 @@ def find_impossible_conditions(problem: TrajectoryProblem) -> list[Violation]:
                     Violation("closure", goal.about, amount=error, unit="m", detail=detail)
                 )
     for phase, end in zip(problem.task.phases, problem.ends.tolist(), strict=True):
-        for name, value in problem.coordinate_goals(phase).items():
+        for name, (least, most) in problem.coordinate_goals(phase).items():
             lower, upper = problem.limits(name)
-            beyond = max(lower - value, value - upper)
+            beyond = max(lower - most, least - upper)
             if beyond > LIMIT_SLACK:
                 unit = problem.unit(name)
+                value = most if most < lower else least
                 detail = (
                     f"{value:g} {unit} is beyond the limits {lower:g} to {upper:g} {unit} "
                     f"by {beyond:.4g} {unit}"
@@ -101,7 +104,39 @@ def find_impossible_conditions(problem: TrajectoryProblem) -> list[Violation]:
                 found.append(
                     Violation("goal", name, waypoint=end, amount=beyond, unit=unit, detail=detail)
                 )
+        if phase.kind == "configure":
+            found += _find_collisions_at_goal(problem, end)
     return found
+
+
+def _find_collisions_at_goal(problem: TrajectoryProblem, end: int) -> list[Violation]:
+    """Find the pairs that are too close at a waypoint whatever the coordinates left free are."""
+    lower, upper = problem.lower[end - 1], problem.upper[end - 1]
+    z = np.clip(problem.start, lower, upper)
+    reach = problem.options.largest_margin
+    contacts = problem.contacts.evaluate(z[None], np.array([end]), reach=reach)
+    labels = problem.contacts.phases[problem.contacts.find_phase(end)].labels
+    joints = problem.contacts.get_joints(contacts.pair).tolist()
+    moving = set(np.flatnonzero(problem.chain.coordinates.find_moved_joints(lower < upper)))
+    supports = [set(joint_path) for joint_path in problem.chain.model.supports]
+    found = dict[str, Violation]()
+    for (first, second), ends, distance, margin in zip(
+        contacts.pair, joints, contacts.distance.tolist(), contacts.margin.tolist(), strict=True
+    ):
+        between = supports[ends[0]] ^ supports[ends[1]]
+        if FLOOR in (labels[first], labels[second]):
+            between.discard(_BASE)  # driving leaves the distance from the floor as it is
+        if margin - distance <= ACCEPTED_SHORTFALL or between & moving:
+            continue
+        subject = f"{labels[first]} – {labels[second]}"
+        detail = f"overlap by {-1e3 * distance:.1f} mm at the goal"
+        if distance > 0.0:
+            detail = f"are only {1e3 * distance:.1f} of {1e3 * margin:g} mm apart at the goal"
+        amount = margin - distance
+        worst = Violation("goal", subject, waypoint=end, amount=amount, unit="m", detail=detail)
+        # Contacts are sorted: the deepest of links with several shapes comes first.
+        found.setdefault(subject, worst)
+    return list(found.values())
 
 
 def diagnose_goals(problem: TrajectoryProblem, random_seed: int) -> list[BlockedGoal]:

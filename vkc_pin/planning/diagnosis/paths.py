@@ -103,7 +103,7 @@ def _find_base_goals(
     The motion ends the phase at base pose `last`.
     """
     end = int(problem.ends[number])
-    if problem.task.phases[number].base is None:
+    if not problem.task.phases[number].configuration:
         rng = np.random.default_rng(random_seed)
         samples = sample_goal_configurations(problem, end, rng)
         if samples is not None:

@@ -116,8 +116,11 @@ def _find_base_goals(problem: TrajectoryProblem, number: int) -> tuple[list[_Bas
     """Return necessary base positions at a phase's end, and reasons why goals are unreachable."""
     phase, end = problem.task.phases[number], int(problem.ends[number])
     goals, beyond = [], []
-    if phase.base is not None:
-        goals.append(_BaseGoal(np.array(phase.base[:2], float), _TOLERANCE))
+    names = problem.chain.names[:2]
+    if phase.configuration.keys() >= {*names}:
+        place = np.array([phase.configuration[name] for name in names])
+        radius = float(np.hypot(*np.ptp(place, axis=1))) / 2
+        goals.append(_BaseGoal(place.mean(axis=1), radius + _TOLERANCE))
     for goal in problem.pose_goals:
         if end not in goal.row.waypoints or goal.row.kind == "level" or goal.row.shift is not None:
             continue

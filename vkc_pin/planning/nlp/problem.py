@@ -186,8 +186,8 @@ class TrajectoryProblem:
             for name, value in phase.initial_values.items():
                 low_high = phase.ranges.get(name, (value, value))
                 bounds[inside, self.chain.index(name)] = low_high
-            for name, value in self.coordinate_goals(phase).items():
-                bounds[end - 1, self.chain.index(name)] = np.clip(value, *self.limits(name))
+            for name, interval in self.coordinate_goals(phase).items():
+                bounds[end - 1, self.chain.index(name)] = np.clip(interval, *self.limits(name))
         # Clamped freedoms are constant until the object is released.
         for hold in self._continued_holds:
             if self.scene.objects[hold.object].object.attachments[hold.attachment].firm:
@@ -231,16 +231,19 @@ class TrajectoryProblem:
             lower, upper = max(lower, low), min(upper, high)
         return lower, upper
 
-    def coordinate_goals(self, phase: Phase) -> dict[str, float]:
-        """Return coordinate → value at the end of a phase, as requested, [m] and [rad].
+    def coordinate_goals(self, phase: Phase) -> dict[str, tuple[float, float]]:
+        """Return coordinate → (lower, upper) at the end of a phase, as requested, [m] and [rad].
 
-        A heading of the base is the equivalent one nearest to the start.
+        Of equivalent angles without limits, such as headings, it is the one nearest to the start.
         """
-        base = zip(self.chain.names, phase.base or (), strict=False)
-        goals = dict(phase.values) | {name: goal for name, goal in base if goal is not None}
-        heading = self.chain.names[2]
-        if heading in goals:
-            goals[heading] = self.start[2] + wrap_angle(goals[heading] - self.start[2])
+        goals = {name: (value, value) for name, value in phase.values.items()}
+        for name, (lower, upper) in phase.configuration.items():
+            column = self.chain.index(name)
+            turns = 0.0
+            if self.unit(name) == "rad" and np.isinf(self.chain.upper[column]):
+                away = (lower + upper) / 2 - self.start[column]
+                turns = wrap_angle(away) - away
+            goals[name] = lower + turns, upper + turns
         return goals
 
     def unit(self, name: str) -> str:

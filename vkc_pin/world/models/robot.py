@@ -18,7 +18,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import check_integer
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.urdf import UrdfFile
-from vkc_pin.world.models.coordinates import Coordinates
+from vkc_pin.world.models.coordinates import Coordinates, MovedJoint
 from vkc_pin.world.models.dynamics import TorqueLimits, compute_torque_limits
 from vkc_pin.world.models.grafting import round_placement
 from vkc_pin.world.models.gripper import Gripper
@@ -129,6 +129,23 @@ class Robot:
     def frame_names(self) -> tuple[str, ...]:
         """Names of its frames, without that of the world."""
         return tuple(str(frame.name) for frame in self.model.frames if frame.name != "universe")
+
+    @cached_property
+    def planned_joints(self) -> Mapping[str, MovedJoint]:
+        """Coordinate, or joint coupled to one → the coordinate that drives it, and how."""
+        coordinates = self.coordinates
+        found = {}
+        for column, name in enumerate(coordinates.names):
+            slides = coordinates.units[column] == "m"
+            found[name] = MovedJoint(column, coordinates.joints[column], 1.0, 0.0, slides)
+        for move in coordinates.followers:
+            found[str(self.model.names[move.joint])] = move
+        return found
+
+    def is_periodic(self, coordinate: int) -> bool:
+        """Return whether full turns of a coordinate make no difference."""
+        is_angle = self.coordinates.units[coordinate] == "rad"
+        return is_angle and bool(np.isinf(self.upper[coordinate]))
 
     @cached_property
     def efforts(self) -> TorqueLimits:

@@ -194,18 +194,24 @@ class Scene:
         }
         return Scene.from_document(document, self.folder)
 
-    def with_start(self, base: ArrayLike | None = None, arm: ArrayLike | None = None) -> Scene:
+    def with_start(
+        self, base: ArrayLike | None = None, arm: ArrayLike | Mapping[str, float] | None = None
+    ) -> Scene:
         """Return the scene with another start.
 
         Args:
             base: x, y [m] and yaw [rad] in the world frame, shape (3,); None keeps it.
-            arm: Arm joints [rad], shape (n - 3,); None keeps them.
+            arm: Arm joints [rad], shape (n - 3,), or joint → value for some of them; None keeps
+                them.
 
         Raises:
+            UnknownNameError: The robot has no such arm joint.
             InputError: Wrong size, a value that is not finite, outside a joint's limits or outside
                 the arena.
         """
         start, names = self.start.copy(), self.robot.coordinates.names
+        if isinstance(arm, Mapping):
+            arm = self._fill_arm(arm)
         for part_name, values, part in (("base", base, slice(0, 3)), ("arm", arm, slice(3, None))):
             if values is None:
                 continue
@@ -225,6 +231,15 @@ class Scene:
             )
         ]
         return self._with(start=start)
+
+    def _fill_arm(self, given: Mapping[str, float]) -> list[float]:
+        """Return the values of all arm joints; those that are not named stay."""
+        names = self.robot.coordinates.names[3:]
+        values = check_mapping(given, "arm", "joint → value")
+        for joint in values:
+            check_choice(joint, names, f"arm joint of robot '{self.robot.name}'", "arm")
+        stay = zip(names, self.start[3:].tolist(), strict=True)
+        return [values.get(joint, value) for joint, value in stay]
 
     def with_state(self, name: str, values: Mapping[str, float]) -> Scene:
         """Return the scene with joints of object `name` at `values`.

@@ -210,8 +210,12 @@ def _check_within_arena(
 
 
 def _make_start(document: Document, item: schema.StartSchema, robot: Robot) -> Floats:
-    arm = robot.home if item.arm is None else np.array(item.arm)
     names = robot.coordinates.names[3:]
+    is_named = isinstance(item.arm, Mapping)
+    if isinstance(item.arm, Mapping):
+        arm = np.array(_fill_arm(document, item.arm, robot))
+    else:
+        arm = robot.home if item.arm is None else np.array(item.arm)
     if len(arm) != len(names):
         expected = f"{len(names)} values: {', '.join(names)}"
         raise document.make_error(
@@ -220,10 +224,23 @@ def _make_start(document: Document, item: schema.StartSchema, robot: Robot) -> F
     start = np.concatenate([item.base, arm])
     lower, upper = robot.start_limits
     for index, name in enumerate(robot.coordinates.names):
-        path = ("start", "base", index) if index < 3 else ("start", "arm", index - 3)
+        path: tuple[str, str, str | int] = ("start", "base", index)
+        if index >= 3:
+            path = ("start", "arm", name if is_named else index - 3)
         with document.annotate_errors(path):
             start[index] = check_start_value(start[index], lower[index], upper[index], name)
     return start
+
+
+def _fill_arm(document: Document, given: Mapping[str, float], robot: Robot) -> list[float]:
+    """Return the values of all arm joints; those that are not named are at home."""
+    names = robot.coordinates.names[3:]
+    for joint in given:
+        if joint not in names:
+            path, kind = ("start", "arm", joint), f"arm joint of robot '{robot.name}'"
+            raise document.make_unknown_name_error(path, kind, joint, names)
+    homes = zip(names, robot.home.tolist(), strict=True)
+    return [given.get(joint, value) for joint, value in homes]
 
 
 def _make_holds(

@@ -87,12 +87,11 @@ def _parse_scale(value: Any) -> Any:
 
 
 def _parse_arm(value: Any) -> Any:
+    expected = "home, a list of joint values [rad], or a mapping from joint to value"
     if isinstance(value, str) and value != "home":
-        raise make_validation_error(
-            f"unknown arm configuration '{value}'", "home, or a list of joint values [rad]"
-        )
-    if not isinstance(value, str | list | tuple):
-        raise make_validation_error("wrong value", "home, or a list of joint values [rad]")
+        raise make_validation_error(f"unknown arm configuration '{value}'", expected)
+    if not isinstance(value, str | list | tuple | Mapping):
+        raise make_validation_error("wrong value", expected)
     return None if value == "home" else value
 
 
@@ -256,6 +255,7 @@ class HeldSchema(Schema):
 class StartSchema(Schema):
     """The start: base [x, y, yaw], arm joints [rad], and object → attachment or hold.
 
+    Arm joints that a mapping does not name are as in the robot's home configuration.
     `z` is the constant height of the robot's root link [m]; default: the robot's own. `opening` is
     the gripper opening [m]; default: that of the robot's rest configuration.
     """
@@ -263,7 +263,9 @@ class StartSchema(Schema):
     base: Vector3
     z: Number | None = None
     opening: NonNegative | None = None
-    arm: Annotated[tuple[Number, ...] | None, BeforeValidator(_parse_arm)] = None
+    arm: Annotated[
+        tuple[Number, ...] | Mapping[str, Number] | None, BeforeValidator(_parse_arm)
+    ] = None
     held: Mapping[str, Annotated[HeldSchema, wrap_text("attachment")]] = Field(default_factory=dict)
 
 

@@ -22,6 +22,7 @@ from vkc_pin.world.task.actuation import (
     find_shared_coordinate,
     list_driving_attachments,
 )
+from vkc_pin.world.task.configurations import check_pose_is_meant, find_configuration
 from vkc_pin.world.task.lookup import (
     check_link,
     compute_openings,
@@ -42,6 +43,7 @@ from vkc_pin.world.task.phases import (
 )
 from vkc_pin.world.task.steps import (
     Actuate,
+    Configure,
     GoTo,
     Grasp,
     Place,
@@ -448,13 +450,20 @@ class _Compiler:
         elif isinstance(step, Grasp):
             self.grasp(step.object, step.attachment, where, step.by)
         elif isinstance(step, Reach):
+            check_pose_is_meant(self.scene, step, f"{where}.pose")
             frame = find_robot_frame(self.scene, step.frame, f"{where}.frame")
             self._release_fixed_objects()
             goals = (FrameGoal(frame, step.pose),)
             self._append("reach", (frame,), self.options.reach_waypoints, frames=goals)
+        elif isinstance(step, Configure):
+            configuration = find_configuration(self.scene, step, where)
+            self._release_fixed_objects()
+            self._append("configure", (), self.options.reach_waypoints, configuration=configuration)
         elif isinstance(step, GoTo):
             self._release_fixed_objects()
-            self._append("go", (), self.options.reach_waypoints, base=(step.x, step.y, step.yaw))
+            base = zip(self.scene.robot.coordinates.names, (step.x, step.y, step.yaw), strict=False)
+            goal = {name: (value, value) for name, value in base if value is not None}
+            self._append("go", (), self.options.reach_waypoints, configuration=goal)
 
 
 def compile_task(

@@ -24,7 +24,7 @@ __all__ = [
     "summarize_phases",
 ]
 
-PhaseKind = Literal["grasp", "reach", "touch", "place", "turn", "move", "go", "stand"]
+PhaseKind = Literal["grasp", "reach", "touch", "place", "turn", "move", "go", "configure", "stand"]
 PhaseKey = tuple[PhaseKind, tuple[str, ...]]
 _VERBS: Mapping[PhaseKind, str] = {
     "grasp": "reach",
@@ -34,6 +34,7 @@ _VERBS: Mapping[PhaseKind, str] = {
     "turn": "turn",
     "move": "move",
     "go": "go to",
+    "configure": "configure",
     "stand": "stand still",
 }
 
@@ -66,9 +67,10 @@ class Phase:
 
     Attributes:
         kind: Kind of phase: "grasp", "reach" of a frame, "touch", "place", "turn" (a joint that
-            releases a latch), "move" (joints of an object), "go" (of the base), or "stand" (still).
+            releases a latch), "move" (joints of an object), "go" (of the base), "configure" (joints
+            of the robot), or "stand" (still).
         about: Subject of the phase: object and attachment (and the link that holds it, or ""),
-            frame, object or coordinates.
+            frame, object or coordinates; empty for "go", "configure" and "stand".
         segments: Number of time steps; the phase has `segments + 1` waypoints, the first of which
             is the last of the previous phase.
         held: Holds during the phase, each after the one it depends on.
@@ -78,7 +80,8 @@ class Phase:
         pushed: Object coordinate → 1 or -1, for coordinates that are pushed and can only increase
             or decrease.
         frames: Frame goals at the last waypoint.
-        base: Goal (x, y, yaw or None) of the base at the last waypoint, world frame.
+        configuration: Coordinate of the robot → (lower, upper) at the last waypoint. An angle
+            without limits may differ by full turns.
         grasps: Holds that begin at the last waypoint.
         released: Holds that ended just before the phase.
         initial_values: Object coordinate → value at the first waypoint, for the joints that the
@@ -100,7 +103,7 @@ class Phase:
     values: Mapping[str, float] = field(default_factory=dict)
     pushed: Mapping[str, int] = field(default_factory=dict)
     frames: tuple[FrameGoal, ...] = ()
-    base: tuple[float, float, float | None] | None = None
+    configuration: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     grasps: tuple[Hold, ...] = ()
     released: tuple[Hold, ...] = ()
     initial_values: Mapping[str, float] = field(default_factory=dict)

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from typing import Any
 
+import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError, UnknownNameError, format_value
@@ -15,6 +16,7 @@ from vkc_pin.utils.arguments import (
     check_coordinate,
     check_list,
     check_mapping,
+    check_number,
     check_text,
 )
 from vkc_pin.world.scene.poses import as_placement, as_target
@@ -22,6 +24,7 @@ from vkc_pin.world.scene.poses import as_placement, as_target
 __all__ = [
     "STEPS",
     "Actuate",
+    "Configure",
     "GoTo",
     "Grasp",
     "Place",
@@ -48,18 +51,29 @@ def _check_names(step: Any, **optional: bool) -> None:
 
 @dataclass(frozen=True)
 class Reach:
-    """Bring a frame of the robot to a pose.
+    """Bring a frame of the robot to a pose. For a goal in joint space, see `Configure`.
 
     Attributes:
-        pose: Goal pose in the world frame; see `as_placement` for its forms.
+        pose: Goal pose in the world frame; see `as_placement` for its forms. A list or an array of
+            as many numbers as the arm has joints, and within their limits, is refused, since it may
+            be meant as joint values; a tuple is a pose.
         frame: Frame of the robot; None: the tool frame.
+        numbers: The pose as given, if it was a list or an array of numbers.
     """
 
     pose: Any
     frame: str | None = None
+    numbers: tuple[float, ...] | None = field(default=None, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "pose", as_placement(self.pose, name="Reach.pose"))
+        if isinstance(self.pose, Mapping):
+            expected = "a pose; Configure brings joints to values"
+            got = format_value(self.pose)
+            raise InputError("not a pose", field="Reach.pose", expected=expected, got=got)
+        given = self.pose
+        object.__setattr__(self, "pose", as_placement(given, name="Reach.pose"))
+        if isinstance(given, list | np.ndarray) and np.ndim(given) == 1:
+            object.__setattr__(self, "numbers", tuple(float(number) for number in given))
         _check_names(self, frame=True)
 
 
@@ -185,6 +199,55 @@ class Release:
 
 
 @dataclass(frozen=True)
+class Configure:
+    """Bring joints of the robot to values: a goal in joint space.
+
+    Free held objects are carried along, fixed ones are released.
+
+    Attributes:
+        joints: Joint → final value, [rad] or [m], for all or some joints of the robot, and for its
+            base: `base_x`, `base_y` [m] and `base_yaw` [rad]. Of a joint without limits and of the
+            heading, values that differ by full turns are the same.
+        tolerance: Largest accepted deviation from the values, [rad] or [m]: one for all joints, or
+            joint → deviation; joints without one must be reached exactly.
+    """
+
+    joints: Mapping[str, float]
+    tolerance: float | Mapping[str, float] = 0.0
+
+    def __post_init__(self) -> None:
+        field = "Configure.joints"
+        expected = "a mapping such as {'elbow_joint': 1.2}"
+        if not isinstance(self.joints, Mapping) or not self.joints:
+            got = format_value(self.joints)
+            raise InputError("nothing to configure", field=field, expected=expected, got=got)
+        given = check_mapping(self.joints, field, expected)
+        joints = {
+            name: check_coordinate(value, f"{field}[{name!r}]") for name, value in given.items()
+        }
+        object.__setattr__(self, "joints", joints)
+        object.__setattr__(self, "tolerance", self._check_tolerance())
+
+    def _check_tolerance(self) -> float | dict[str, float]:
+        field = "Configure.tolerance"
+        expected = "a finite number of at least 0"
+        if not isinstance(self.tolerance, Mapping):
+            return check_number(self.tolerance, field, expected, low=0.0)
+        found = dict[str, float]()
+        for name, value in check_mapping(self.tolerance, field).items():
+            if name not in self.joints:
+                raise UnknownNameError("joint of this step", name, self.joints, field=field)
+            found[name] = check_number(value, f"{field}[{name!r}]", expected, low=0.0)
+        return found
+
+    def get_tolerance(self, joint: str) -> float:
+        """Return the largest accepted deviation of a joint of this step, [rad] or [m]."""
+        if isinstance(self.tolerance, Mapping):
+            return self.tolerance.get(joint, 0.0)
+        return self.tolerance
+
+
+@dataclass(frozen=True)
 class GoTo:
     """Bring the base to a position; free held objects are carried along, fixed ones are released.
 
@@ -205,8 +268,8 @@ class GoTo:
                 )
 
 
-Step = Reach | Grasp | Actuate | GoTo | Touch | Place | Release
-STEPS = (Reach, Grasp, Actuate, GoTo, Touch, Place, Release)
+Step = Reach | Grasp | Actuate | Configure | GoTo | Touch | Place | Release
+STEPS = (Reach, Grasp, Actuate, Configure, GoTo, Touch, Place, Release)
 """All step classes."""
 _KINDS: dict[str, Any] = {kind.__name__: kind for kind in STEPS}
 
@@ -242,7 +305,8 @@ def describe_step(step: Step) -> str:
 
 def step_to_dict(step: Step) -> dict[str, Any]:
     """Return `step` as plain data, e.g. for a saved plan."""
-    data = {"step": type(step).__name__, **vars(step)}
+    own = {one.name: getattr(step, one.name) for one in fields(step) if one.init}
+    data = {"step": type(step).__name__, **own}
     for name, value in data.items():
         if isinstance(value, pin.SE3):
             data[name] = value.homogeneous.tolist()
@@ -253,7 +317,7 @@ def step_from_dict(data: Mapping[str, Any]) -> Step:
     """Return the step that `step_to_dict` converted to `data`."""
     given = check_mapping(data, "step", "a step as data")
     kind = check_choice(given.pop("step", ""), _KINDS, "step", "step")
-    known_fields = {item.name: item for item in fields(_KINDS[kind])}
+    known_fields = {item.name: item for item in fields(_KINDS[kind]) if item.init}
     for name in given:
         if name not in known_fields:
             raise UnknownNameError(f"field of {kind}", name, known_fields, field=f"{kind}.{name}")

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import cache
 
 import numpy as np
 import pinocchio as pin
 import pytest
 from helpers.carrying import BALL, describe_stand
+from helpers.door_closers import load_door_with_closer, replace_object_fields
 from helpers.drawers import compute_handle_pose, replace_scene_fields
-from helpers.drives import make_scene
+from helpers.drives import drive_through, make_scene, move_start
 from helpers.executions import plan_door, plan_drawer
 from helpers.held_sticks import make_fetching_motion
 
@@ -18,6 +20,7 @@ from vkc_pin.planning.plan import Plan
 from vkc_pin.simulation.execution import simulate
 from vkc_pin.world.scene.hold import MAX_ANGLE_DEVIATION, MAX_POSITION_DEVIATION
 from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.world_model import World
 
 GOAL = (-0.6, -1.6, 0.751)  # of the cup, on the table [m]
 
@@ -202,3 +205,106 @@ def test_tool_holds_only_what_it_touches(aside: float, missed: bool) -> None:
     assert grip.distance == pytest.approx(aside, abs=5e-3)
     assert grip.problem is None or "misses ball.pull by stick.tip" in grip.problem
     assert (result.misses[0].amount > 0.05) is missed
+
+
+DRAWER_GRASPS = {
+    "let go": [vkc.Grasp("drawer", "handle")],
+    "released": [vkc.Grasp("drawer", "handle"), vkc.Release("drawer")],
+    "grasped anew": [vkc.Grasp("drawer", "handle"), vkc.Grasp("drawer", "handle_free")],
+    "pushed then": [vkc.Grasp("drawer", "handle"), vkc.Grasp("drawer", "push")],
+    "pushed before": [vkc.Grasp("drawer", "push"), vkc.Grasp("drawer", "handle")],
+}
+
+
+@pytest.mark.parametrize("steps", DRAWER_GRASPS.values(), ids=DRAWER_GRASPS)
+def test_grasp_without_motion_is_measured_when_the_hand_closes(steps: list[vkc.Step]) -> None:
+    """No phase holds the drawer: the robot lets go of it at once, and drives away."""
+    plan = vkc.plan(vkc.load_scene("drawer"), [*steps, vkc.GoTo(-1.0, 0.5)])
+    assert plan.success, plan.summary()
+    assert all(not phase.holds for phase in plan.trajectory.phases)
+    result = plan.simulate()
+    assert result.ok, result.summary()
+    grasps = [miss for miss in result.misses if miss.subject == "grasp of drawer"]
+    count = sum(isinstance(step, vkc.Grasp) for step in steps)
+    assert len(grasps) == 2 * count
+    ends = [float(plan.trajectory.times[phase.last]) for phase in plan.trajectory.phases]
+    assert grasps[0].time == pytest.approx(ends[0], abs=0.02)
+    assert grasps[-1].time <= ends[count - 1] + 0.02
+    aside = plan.simulate(actual=displace(plan.scene, "drawer", (0.0, 0.0, 0.25)))
+    assert not aside.ok
+    assert min(miss.amount for miss in aside.misses if miss.subject == "grasp of drawer") < 0.3
+
+
+def test_released_free_object_is_grasped_before() -> None:
+    steps = [vkc.Grasp("cup"), vkc.Release("cup"), vkc.GoTo(2.0, -2.2)]
+    result = vkc.plan(vkc.load_scene("household"), steps).simulate()
+    assert result.ok, result.summary()
+    assert result.misses[0].time < 3.5
+
+
+@cache
+def make_scene_with_tray() -> Scene:
+    """Return a scene in which the hand holds a tray with two cups on it, which a table carries."""
+    plan = vkc.plan(vkc.load_scene("tray"), [vkc.Grasp("tray")])
+    assert plan.success
+    return plan.end_scene()
+
+
+@pytest.mark.parametrize(("friction", "stays"), [(0.8, True), (0.02, False)])
+def test_objects_on_a_tray_must_stay_there(friction: float, stays: bool) -> None:
+    """The robot pulls a tray off its table by 0.35 m; on a smooth one, cups slide but stand."""
+    scene = make_scene_with_tray()
+    x, y, yaw = scene.start[:3].tolist()
+    motion = drive_through(scene, scene.start, move_start(scene.start, x=x - 0.35), dt=0.05)
+    pulling = dataclasses.replace(motion.phases[0], holds=scene.holds)
+    motion = dataclasses.replace(motion, phases=(pulling,))
+    physics = vkc.Physics(friction=friction)
+    result = simulate(scene, [vkc.GoTo(x - 0.35, y, yaw)], motion, physics=physics)
+    assert result.contacts == ()
+    assert result.grips[0].problem is None
+    misses = {miss.subject: miss.amount for miss in result.misses if miss.unit == "m"}
+    assert misses.keys() == {"base", "cup on tray.tray", "mug on tray.tray"}
+    world = World(scene)
+    planned, real = (
+        world.get_placement("tray", row).actInv(world.get_placement("cup", row))
+        for row in (world.start, result.rows[-1])
+    )
+    slid = float(np.linalg.norm(real.translation - planned.translation))
+    assert misses["cup on tray.tray"] == pytest.approx(slid, abs=1e-6)
+    assert (slid < 0.01) is stays
+    assert result.ok is stays
+
+
+@pytest.mark.parametrize(("stiffness", "stays"), [(0.0, True), (100.0, False)])
+def test_released_drawer_must_stay_open(stiffness: float, stays: bool) -> None:
+    """A spring shuts it, although the plan leaves it open."""
+    scene = replace_object_fields(
+        vkc.load_scene("drawer"), "drawer", joints={"slide": {"stiffness": stiffness}}
+    )
+    opened = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.25})]).end_scene()
+    x, y, _ = opened.start[:3].tolist()
+    plan = vkc.plan(opened, [vkc.Release("drawer"), vkc.GoTo(x - 0.6, y)])
+    assert plan.success, plan.summary()
+    result = plan.simulate()
+    miss = result.misses[0]
+    assert (miss.step, miss.subject, miss.unit) == (1, "drawer.slide", "m")
+    assert (miss.amount < 0.01) is stays
+    assert stays or miss.amount > 0.2
+    assert result.ok is stays
+
+
+def test_lever_may_return_when_it_is_released() -> None:
+    plan = vkc.plan(
+        load_door_with_closer(friction=1.0),
+        [vkc.Actuate("door", {"hinge": -0.8}), vkc.Release("door")],
+    )
+    assert plan.success, plan.summary()
+    assert [miss.subject for miss in plan.simulate().misses] == ["door.hinge", "door.hinge"]
+
+
+def test_hand_that_misses_the_last_grasp_holds_nothing_then() -> None:
+    plan = vkc.plan(vkc.load_scene("household"), [vkc.Grasp("cup")])
+    assert plan.simulate().end_scene().held == {"cup": "side"}
+    result = plan.simulate(actual=displace(plan.scene, "cup", (0.0, 0.05, 0.0)))
+    assert not result.ok
+    assert result.end_scene().held == {}

@@ -14,6 +14,7 @@ from vkc_pin.world.models.articulated_object import Attachment
 from vkc_pin.world.models.coordinates import wrap_angle
 from vkc_pin.world.scene.contact_rules import compute_hand_frame
 from vkc_pin.world.scene.hold import (
+    Hold,
     apply_deviation,
     compute_distances,
     is_within_grasp,
@@ -31,10 +32,11 @@ from vkc_pin.world.task.steps import (
     Step,
     Touch,
 )
+from vkc_pin.world.trajectory.free_objects import FreeObjects
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
-__all__ = ["Miss", "measure_goal_errors"]
+__all__ = ["Miss", "compute_placement", "measure_goal_errors"]
 
 _TOLERANCE = 2e-3  # [m] or [rad] within which a plan counts as having completed a step
 _LASTING = (Actuate, Place, Release)  # steps after which objects stay where they are
@@ -82,8 +84,9 @@ def measure_goal_errors(
     """Return the error of every goal.
 
     Each step is measured when the plan completes it for the first time, in order; the last step is
-    measured at the end. Objects that are moved or released must stay where the plan leaves them:
-    they are measured when it moves them on, or else at the end.
+    measured at the end. Objects that are moved or released must stay where the plan leaves them,
+    and those that are carried along must stay on their supports: they are measured when the plan
+    moves them on, or else at the end.
 
     Args:
         scene: Scene of the plan.
@@ -95,7 +98,13 @@ def measure_goal_errors(
     """
     goals = _Goals(World(scene), world, trajectory)
     completed, errors, last = 0, list[Miss](), len(goals.edges) - 1
+
+    def find_row(edge: int) -> int:
+        at = float(trajectory.times[goals.edges[edge]])
+        return len(times) - 1 if edge == last else int(np.argmin(np.abs(times - at)))
+
     for number, step in enumerate(steps):
+        before = completed
         if number == len(steps) - 1:
             completed = last
         while completed < last and not goals.is_completed(step, completed):
@@ -104,10 +113,15 @@ def measure_goal_errors(
         if isinstance(step, _LASTING):
             while edge < last and goals.is_completed(step, edge + 1):
                 edge += 1
-        at = float(trajectory.times[goals.edges[edge]])
-        row = len(times) - 1 if edge == last else int(np.argmin(np.abs(times - at)))
+        row = find_row(edge)
         for subject, amount, unit in goals.compute_errors(step, completed, edge, rows[row]):
             errors.append(Miss(number + 1, subject, amount, unit, float(times[row])))
+        for name, support in goals.find_supported(before, completed).items():
+            edge = goals.find_rest(name, completed)
+            row = find_row(edge)
+            found = goals.compute_support_errors(name, support, edge, rows[row])
+            for subject, amount, unit in found:
+                errors.append(Miss(number + 1, subject, amount, unit, float(times[row])))
     return tuple(errors)
 
 
@@ -120,21 +134,23 @@ class _Goals:
         trajectory: The plan.
         edges: Waypoints between phases, the first and the last one included.
         ends: World coordinates of the plan there, shape (edges, n).
+        supports: For every phase, supported free object → supporting link.
     """
 
     def __init__(self, planned: World, world: World, trajectory: Trajectory) -> None:
         self.planned, self.world, self.trajectory = planned, world, trajectory
         self.edges = [0, *(phase.last for phase in trajectory.phases)]
-        self.ends = planned.compute_positions(trajectory, trajectory.times[self.edges])
+        free = FreeObjects(planned.scene, trajectory)
+        self.ends = planned.compute_positions(trajectory, trajectory.times[self.edges], free)
+        self.supports = free.supports
 
     def is_completed(self, step: Step, edge: int) -> bool:
         """Return whether the plan has completed a step at an edge."""
-        if isinstance(step, Grasp | Release):
-            phases = self.trajectory.phases
-            held = phases[min(edge, len(phases) - 1)].held  # after the edge
-            if step.object is None:
-                return not held
-            return (step.object in held) == isinstance(step, Grasp)
+        if isinstance(step, Grasp):
+            return self._find_grasp(step, edge) is not None
+        if isinstance(step, Release):
+            held = {hold.object for hold in self._get_holds_after(edge)}
+            return not held if step.object is None else step.object not in held
         errors = _compute_goal_errors(self.planned, self.planned.scene, step, self.ends[edge])
         return all(amount <= _TOLERANCE for _, amount, _ in errors)
 
@@ -148,40 +164,111 @@ class _Goals:
             row: World coordinates of the execution there, shape (n,).
         """
         if isinstance(step, Grasp):
-            yield from self._compute_grasp_errors(step, self.ends[edge], row)
+            yield from self._compute_grasp_errors(step, edge, row)
         elif isinstance(step, Release):
-            yield from self._compute_release_errors(step, completed, self.ends[edge], row)
+            yield from self._compute_release_errors(step, completed, edge, row)
         else:
             yield from _compute_goal_errors(self.world, self.planned.scene, step, row)
 
-    def _compute_grasp_errors(self, step: Grasp, planned: Floats, row: Floats) -> Errors:
+    def find_supported(self, before: int, completed: int) -> Mapping[str, str]:
+        """Return the free objects that others carry along between two edges, and on which link."""
+        found: dict[str, str] = {}
+        for supports in self.supports[before:completed]:
+            found |= supports
+        return found
+
+    def find_rest(self, name: str, edge: int) -> int:
+        """Return the last edge until which the plan leaves a free object where it is at `edge`."""
+        there = self.planned.get_placement(name, self.ends[edge])
+        while edge + 1 < len(self.edges):
+            later = self.planned.get_placement(name, self.ends[edge + 1])
+            if np.abs(pin.log6(there.actInv(later)).vector).max() > _TOLERANCE:
+                break
+            edge += 1
+        return edge
+
+    def compute_support_errors(self, name: str, support: str, edge: int, row: Floats) -> Errors:
+        """Yield how far a free object has moved on its support, and tilted, since the plan's edge.
+
+        Contacts let an object turn about the vertical by some 10 mrad, which does not count.
+
+        Args:
+            name: The object.
+            support: Link that it is on, "<object>.<link>".
+            edge: Edge of the plan.
+            row: World coordinates of the execution there, shape (n,).
+        """
+        below = compute_placement(self.planned, self.ends[edge], support)
+        goal = below.actInv(self.planned.get_placement(name, self.ends[edge]))
+        real = compute_placement(self.world, row, support).actInv(
+            self.world.get_placement(name, row)
+        )
+        vertical = below.rotation[2]  # in the support's frame
+        cosine = (goal.rotation.T @ vertical) @ (real.rotation.T @ vertical)
+        subject = f"{name} on {support}"
+        yield subject, float(np.linalg.norm(real.translation - goal.translation)), "m"
+        yield subject, float(np.arccos(np.clip(cosine, -1.0, 1.0))), "rad"
+
+    def _get_holds_after(self, edge: int) -> Sequence[Hold]:
+        """Return the holds of the phase that begins at an edge; at the end, those of the last."""
+        phases = self.trajectory.phases
+        return phases[min(edge, len(phases) - 1)].holds
+
+    def _find_grasp(self, step: Grasp, edge: int) -> Attachment | None:
+        """Return the attachment at which the plan grasps an object at an edge; None: it does not.
+
+        The plan holds the object after the edge, or the hand is at an attachment but lets go of it
+        at once, so that no phase holds the object. A grasp that is held has the plan's deviation.
+        """
+        item, planned = self.planned.scene.objects[step.object].object, self.ends[edge]
+        for hold in self._get_holds_after(edge):
+            is_wanted = step.attachment in (None, hold.attachment) and step.by == hold.frame
+            if hold.object == step.object and is_wanted:
+                attachment = item.attachment(hold.attachment)
+                deviation = _measure_grasp(self.planned, step, attachment, planned)
+                is_planned = is_within_grasp(*compute_distances(deviation))
+                return apply_deviation(attachment, deviation.tolist()) if is_planned else attachment
+        names = item.attachments if step.attachment is None else [step.attachment]
+        for attachment in (item.attachment(name) for name in names):
+            deviation = _measure_grasp(self.planned, step, attachment, planned)
+            if max(compute_distances(deviation)) <= _TOLERANCE:
+                return attachment
+        return None
+
+    def _compute_grasp_errors(self, step: Grasp, edge: int, row: Floats) -> Errors:
         """Yield how far the hand is from the attachment, compared with the plan.
 
-        The attachment is the first one that the plan grasps there; its freedoms are free.
+        Freedoms of the attachment are free.
         """
-        item = self.planned.scene.objects[step.object].object
-        attachment = item.attachment(step.attachment)
-        candidates = item.attachments.values() if step.attachment is None else [attachment]
-        for candidate in candidates:
-            deviation = _measure_grasp(self.planned, step, candidate, planned)
-            if is_within_grasp(*compute_distances(deviation)):
-                attachment = apply_deviation(candidate, deviation.tolist())
-                break
+        attachment = self._find_grasp(step, edge)
+        if attachment is None:  # the plan does not complete the step
+            attachment = self.planned.scene.objects[step.object].object.attachment(step.attachment)
         distance, angle = compute_distances(_measure_grasp(self.world, step, attachment, row))
         yield f"grasp of {step.object}", distance, "m"
         yield f"grasp of {step.object}", angle, "rad"
 
     def _compute_release_errors(
-        self, step: Release, completed: int, planned: Floats, row: Floats
+        self, step: Release, completed: int, edge: int, row: Floats
     ) -> Errors:
-        """Yield how far released free objects are from where the plan leaves them."""
-        released = self._find_released(step, completed)
+        """Yield how far released objects are from where the plan leaves them.
+
+        Levers that release a latch may return.
+        """
+        released, coordinates = self._find_released(step, completed), self.planned.coordinates
         for name, placed in self.planned.scene.objects.items():
-            if name in released and placed.object.free:
-                goal = self.planned.get_placement(name, planned)
+            if name not in released:
+                continue
+            if placed.object.free:
+                goal = self.planned.get_placement(name, self.ends[edge])
                 off = goal.actInv(self.world.get_placement(name, row))
                 yield name, float(np.linalg.norm(off.translation)), "m"
                 yield name, float(np.linalg.norm(pin.log3(off.rotation))), "rad"
+            levers = {latch.released_by for latch in placed.object.latches}
+            for joint in placed.object.coordinates.names:
+                if joint not in levers:
+                    column = coordinates.index(f"{name}.{joint}")
+                    error = abs(float(row[column] - self.ends[edge][column]))
+                    yield f"{name}.{joint}", error, coordinates.units[column]
 
     def _find_released(self, step: Release, completed: int) -> Mapping[str, str]:
         """Return the objects that a step releases: those that were held last before."""
@@ -194,10 +281,10 @@ class _Goals:
 def _measure_grasp(world: World, step: Grasp, attachment: Attachment, row: Floats) -> Floats:
     """Return how far the grasping frame is from an attachment; see `measure_deviation`."""
     robot = world.scene.robot
-    hand = _compute_placement(world, row, step.by or robot.tool_frame)
+    hand = compute_placement(world, row, step.by or robot.tool_frame)
     if step.by is None:
         hand = hand * compute_hand_frame(robot, attachment)
-    link = _compute_placement(world, row, f"{step.object}.{attachment.link}")
+    link = compute_placement(world, row, f"{step.object}.{attachment.link}")
     _, deviation = measure_deviation(attachment, hand.actInv(link * attachment.placement))
     return deviation
 
@@ -242,7 +329,7 @@ def _compute_pose_errors(
     else:
         frame = step.frame or scene.robot.tool_frame
     goal: Any = step.target if isinstance(step, Touch) else step.pose
-    placement, has_pose = _compute_placement(world, row, frame), isinstance(goal, pin.SE3)
+    placement, has_pose = compute_placement(world, row, frame), isinstance(goal, pin.SE3)
     position = goal.translation if has_pose else np.asarray(goal)
     yield frame, float(np.linalg.norm(placement.translation - position)), "m"
     if has_pose:
@@ -254,7 +341,7 @@ def _compute_pose_errors(
         yield frame, float(np.arccos(np.clip(placement.rotation[2] @ vertical, -1.0, 1.0))), "rad"
 
 
-def _compute_placement(world: World, row: Floats, frame: str) -> pin.SE3:
+def compute_placement(world: World, row: Floats, frame: str) -> pin.SE3:
     """Return the placement of a frame at configuration `row`."""
     data = world.model.createData()
     pin.forwardKinematics(world.model, data, world.coordinates.q(row))

@@ -14,7 +14,7 @@ import pinocchio as pin
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
 from vkc_pin.simulation.contacts import Contact
-from vkc_pin.simulation.goals import Miss
+from vkc_pin.simulation.goals import Miss, compute_placement
 from vkc_pin.simulation.physics import Physics
 from vkc_pin.simulation.replay import write_page
 from vkc_pin.simulation.servos import Servo
@@ -22,7 +22,14 @@ from vkc_pin.simulation.snapshots import write_snapshots, write_video
 from vkc_pin.simulation.welds import Grip
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.writing import write_atomically
-from vkc_pin.world.scene.hold import Hold, get_attachment, measure_grasp
+from vkc_pin.world.scene.hold import (
+    Hold,
+    compute_distances,
+    get_attachment,
+    is_within_grasp,
+    measure_deviation,
+    measure_grasp,
+)
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actions import compile_each_step
 from vkc_pin.world.task.steps import Step, step_to_dict
@@ -137,7 +144,7 @@ class SimulationResult:
         """Return the scene as it really is at the end, from which planning can continue.
 
         Robot and objects are where the execution left them. Grasps are as measured there; objects
-        that were pushed, or pulled out of the hand, are not held.
+        that were pushed or missed, or pulled out of the hand, are not held.
 
         Raises:
             InputError: The integration diverged, or an object slipped by more than 20 mm or
@@ -150,13 +157,27 @@ class SimulationResult:
         world, row = World(self.scene), self.rows[-1]
         values = dict(zip(world.coordinates.names, row.tolist(), strict=True))
         scene = make_scene_at(self.scene, world, row, values)
+        tool = compute_placement(world, row, scene.robot.tool_frame)
         lost = {grip.what: grip.problem is not None for grip in self.grips}  # the last time
+        kept = {str(hold) for hold in self.planned.phases[-1].holds}
         holds, measured = list[Hold](), dict[str, pin.SE3]()
         for hold in compile_each_step(self.scene, self.steps, Options())[-1].after:
-            pushes = get_attachment(scene.objects, hold).contact == "push"
-            if not (lost.get(str(hold)) or pushes) and hold.by in (None, *holds):
+            attachment = get_attachment(scene.objects, hold)
+            if attachment.contact == "push" or hold.by not in (None, *holds):
+                continue
+            # The scene's robot is within limits that the real one may exceed a little. A free
+            # object stays where it is in the hand, an articulated one where it is in the world.
+            is_free = scene.objects[hold.object].object.free
+            place_tool = (lambda: tool) if is_free else scene.tool_placement
+            grasp = measure_grasp(scene.objects, hold, place_tool)
+            if str(hold) in kept:
+                is_lost = lost.get(str(hold), False)
+            else:  # the hand closes at the end
+                _, deviation = measure_deviation(attachment, grasp)
+                is_lost = not is_within_grasp(*compute_distances(deviation))
+            if not is_lost:
                 holds.append(hold)
-                measured[hold.object] = measure_grasp(scene.objects, hold, scene.tool_placement)
+                measured[hold.object] = grasp
         held = scene.with_held([hold.nominal for hold in holds], measured=measured)
         return replace(held, opening=self.planned.phases[-1].opening)
 

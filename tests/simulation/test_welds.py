@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
+import pinocchio as pin
 import pytest
+from helpers.carrying import describe_table, make_carrying_motion, make_room, solve_reach
 from helpers.executions import make_grasping_scene, make_stationary_motion, plan_door, replace_mass
 from helpers.robots import compute_placement
 
 import vkc_pin as vkc
 from vkc_pin.simulation.execution import simulate
 from vkc_pin.simulation.welds import find_hold_spans
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
 
@@ -43,3 +49,51 @@ def test_hold_spans_follow_the_plan() -> None:
     assert (hold.object, begin) == ("stick", -np.inf)
     pushing = vkc.load_scene("door").with_held({"door": "push"})
     assert find_hold_spans(pushing, make_stationary_motion(pushing)) == []
+
+
+@pytest.mark.parametrize(("slide", "held"), [(0.094, True), (0.13, False), (0.3, False)])
+def test_hand_beyond_the_limits_of_a_grasp_holds_nothing(slide: float, held: bool) -> None:
+    """The plan says that the hand grasps the stick there, up to 0.1 m beyond its end."""
+    scene = make_room(describe_table())
+    motion = make_carrying_motion(scene, values=(slide, 0.0)).motion()
+    result = simulate(scene, [vkc.Release("stick")], motion)
+    (grip,) = result.grips
+    assert grip.missed is not held
+    assert grip.distance == pytest.approx(0.0 if held else slide - 0.095, abs=2e-3)
+    start = scene.objects["stick"].placement.translation
+    stick = World(scene).get_placement("stick", result.rows[-1]).translation
+    moved = float(np.linalg.norm(stick - start))
+    assert (moved > 0.4) is held
+    assert held or not result.ok
+
+
+def turn_hand(scene: Scene, angle: float) -> Trajectory:
+    """Return a motion of 3 s in which the hand turns about the bar of the drawer that it holds."""
+    placement = scene.objects["drawer"].link_placement("tray").translation
+    bar = pin.SE3(np.eye(3), placement + np.array([-0.115, 0.0, 0.0]))
+    tool, row = scene.tool_placement(), scene.start
+    rest = make_stationary_motion(scene, 3.0)
+    rows = []
+    for fraction in np.linspace(0.0, 1.0, 41):
+        turned = angle * fraction**2 * (3.0 - 2.0 * fraction)
+        turn = pin.SE3(pin.utils.rotate("y", turned), np.zeros(3))
+        row = solve_reach(bar * turn * bar.inverse() * tool, row)
+        rows.append([*row, *rest.positions[0, len(row) :]])
+    phase = dataclasses.replace(rest.phases[0], last=40)
+    times = np.linspace(0.0, 3.0, 41)
+    return Trajectory(rest.names, times, np.array(rows), (phase,), rest.robot_size)
+
+
+@pytest.mark.parametrize(("angle", "held"), [(-0.5, True), (0.9, False)])
+def test_freedom_of_a_grasp_ends_at_its_limits(angle: float, held: bool) -> None:
+    """A hand that may tilt about the bar by 0.6 rad is turned further, and loses it."""
+    steps = [vkc.Actuate("drawer", {"slide": 0.1}, "handle_free")]
+    scene = vkc.plan(vkc.load_scene("drawer"), steps).simulate().end_scene()
+    (hold,) = scene.holds
+    lower, upper = -0.6, 0.6
+    assert (lower <= hold.at[0] - angle <= upper) is held
+    result = simulate(scene, steps, turn_hand(scene, angle))
+    (grip,) = result.grips
+    assert (grip.broken is None) is held
+    assert result.ok is held
+    assert grip.torque < 1.0 if held else grip.torque > 20.0

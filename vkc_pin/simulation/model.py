@@ -335,6 +335,11 @@ class Builder:
                 name=f"{name} {k}", type=kind, axis=freedom.axis, pos=freedom.through
             )
             joint.damping[0] = _CARRIER_DAMPING
+            if np.isfinite([freedom.lower, freedom.upper]).all():
+                joint.limited = self.mj.mjtLimited.mjLIMITED_TRUE
+                joint.range = freedom.lower, freedom.upper
+                joint.solref_limit = [2.0 * self.physics.timestep, 1.0]  # as stiff as the weld
+                joint.solimp_limit[:2] = _WELD_IMPEDANCE
             joints.append(joint.name)
         return body
 

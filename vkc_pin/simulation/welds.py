@@ -109,7 +109,8 @@ def measure_hand(
         physical: The model.
         data: Its state, an `mujoco.MjData`.
         hold: The hold.
-        planned: Planned values of the attachment's freedoms, [m] and [rad].
+        planned: Planned values of the attachment's freedoms, [m] and [rad]; those beyond the limits
+            count as the limits.
 
     Returns:
         Values of the freedoms, distance [m] and angle [rad] of the holder from the attachment: as
@@ -121,7 +122,11 @@ def measure_hand(
     holder = physical.place_frame(data, hold.frame or scene.robot.tool_frame)
     link = physical.place_frame(data, f"{hold.object}.{attachment.link}")
     measured = holder.actInv(link * attachment.placement)
-    values, deviation = measure_deviation(attachment, measured, tuple(planned))
+    possible = [
+        min(max(value, freedom.lower), freedom.upper)
+        for value, freedom in zip(planned, attachment.freedoms, strict=True)
+    ]
+    values, deviation = measure_deviation(attachment, measured, possible)
     distance, angle = compute_distances(deviation)
     if not is_within_grasp(distance, angle):
         values, deviation = measure_deviation(attachment, measured)

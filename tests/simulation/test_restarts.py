@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.drives import drive_through, move_start
 from helpers.executions import make_grasping_scene, make_stationary_motion, replace_mass
 from helpers.held_sticks import make_scene_with_held_stick
 
@@ -69,13 +70,59 @@ def test_restarts_change_neither_grasp_nor_robot(make: Callable[[], Scene]) -> N
     for _ in range(RESTARTS):
         scene = stand_still(scene)
     name = first.holds[0].object
-    before, after = (
-        one.tool_placement().actInv(one.objects[name].placement) for one in (first, scene)
-    )
-    moved = pin.log6(before.actInv(after)).vector
+    moved = measure_turn(first, scene, name)
     assert np.abs(moved).max() < 2e-5, moved
     assert np.abs(scene.start - first.start).max() < 2e-4
     assert [hold.nominal for hold in scene.holds] == [hold.nominal for hold in first.holds]
+
+
+def measure_turn(first: Scene, last: Scene, name: str = "stick") -> np.ndarray:
+    """Return by how much an object moved in the hand, shape (6,) [m] and [rad]."""
+    before, after = (
+        one.tool_placement().actInv(one.objects[name].placement) for one in (first, last)
+    )
+    return pin.log6(before.actInv(after)).vector
+
+
+def test_grasp_stays_where_the_robot_slightly_exceeds_the_arena() -> None:
+    """The base drives off the arena's border and back; each time it stops a few µm beyond it."""
+    first = make_scene_with_held_stick()
+    first = scene = first.with_start(base=[first.arena[1], 0.0, 0.0])
+    for _ in range(RESTARTS):
+        x = float(scene.start[0])
+        motion = drive_through(
+            scene, scene.start, move_start(scene.start, x=x - 0.2), scene.start, dt=0.025
+        )
+        held = tuple(dataclasses.replace(phase, holds=scene.holds) for phase in motion.phases)
+        rest = make_stationary_motion(scene)
+        positions = np.column_stack(
+            [
+                motion.positions,
+                np.tile(rest.positions[0, rest.robot_size :], (len(motion.times), 1)),
+            ]
+        )
+        motion = dataclasses.replace(motion, names=rest.names, positions=positions, phases=held)
+        result = simulate(scene, [vkc.GoTo(x, 0.0, 0.0)], motion)
+        assert result.rows[-1, 0] > first.arena[1]
+        scene = result.end_scene()
+        assert scene.start[0] <= first.arena[1]
+    moved = measure_turn(first, scene)
+    assert np.abs(moved).max() < 1e-6, moved
+
+
+@pytest.mark.parametrize("mass", [0.4, 4.0, 15.0])
+def test_weld_is_stable_at_any_time_step(mass: float) -> None:
+    """Grasps shorten time steps with which a light wrist would oscillate under its load."""
+    first = scene = replace_mass(make_scene_with_held_stick(), "stick", mass)
+    x, y, yaw = scene.start[:3].tolist()
+    physics = vkc.Physics(timestep=0.01)
+    for _ in range(2):
+        motion = make_stationary_motion(scene, 0.4)
+        result = simulate(scene, [vkc.GoTo(x, y, yaw)], motion, physics=physics)
+        assert result.tracking.arm[0] < 1e-4
+        scene = result.end_scene()
+    moved = measure_turn(first, scene)
+    assert np.abs(moved).max() < 2e-5, moved
 
 
 def test_grasp_carried_from_plan_to_plan_stays() -> None:

@@ -219,6 +219,22 @@ def test_page_times_start_with_the_motion(plan: Plan, page: Path, tmp_path: Path
     assert found == {**note, "time": pytest.approx(note["time"])}
 
 
+@pytest.mark.parametrize(("delay", "slower"), [(1.7e9, 1.0), (-50.0, 1.0), (0.0, 1e9)])
+def test_paths_do_not_depend_on_times(
+    plan: Plan, commands: list[dict[str, Any]], tmp_path: Path, delay: float, slower: float
+) -> None:
+    """Recorded motions begin at the time of a clock, and may last for months."""
+    motion = plan.trajectory
+    times = delay + slower * motion.times
+    other = dataclasses.replace(plan, trajectory=dataclasses.replace(motion, times=times))
+    page = visualization.to_html(other, tmp_path / "page.html").read_text(encoding="utf-8")
+    found, expected = map_objects(read_commands(page)), map_objects(commands)
+    for path in ("/meshcat/paths/tool", "/meshcat/paths/base"):
+        np.testing.assert_allclose(
+            read_vertices(found[path]), read_vertices(expected[path]), atol=1e-3
+        )
+
+
 def test_invalid_arguments_are_rejected(plan: Plan, tmp_path: Path) -> None:
     for call in (
         lambda: visualization.show("door"),

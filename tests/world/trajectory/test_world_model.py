@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.carrying import make_room
 from helpers.small_problems import make_full_scene, sample_configurations
 
 import vkc_pin as vkc
 from vkc_pin.world.scene.placed_object import make_world_shapes
+from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.placements import key_times, sample_motion
 from vkc_pin.world.trajectory.world_model import World, find_coordinate_units
 
@@ -89,6 +91,58 @@ def test_key_times_limit_the_change_of_coordinates(plan: vkc.Plan) -> None:
     assert np.abs(np.diff(motion.at(times), axis=0)).max() <= 1.0 + 1e-9
     finer = key_times(motion, {names[0]: 2.0, names[3]: 0.0125})
     assert np.abs(np.diff(motion.at(finer)[:, 3])).max() <= 0.0125 + 1e-9
+
+
+def interpolate_key_frames(world: World, motion: vkc.Trajectory, at: np.ndarray) -> np.ndarray:
+    """Return world coordinates as a viewer shows them, by straight lines between key frames."""
+    times = sample_motion(world, motion).times
+    rows = world.compute_positions(motion, times)
+    return np.column_stack([np.interp(at, times, column) for column in rows.T])
+
+
+CURVES = {
+    "rest to rest": ([0.0, 1.0], [0.0, 0.9], [0.0, 0.0]),
+    "there and back": ([0.0, 1.0], [0.0, 0.0], [6.0, -6.0]),
+    "far": ([0.0, 2.0], [0.0, 7.0], [0.0, 0.0]),
+    "slow": ([0.0, 1e6], [0.0, 0.9], [0.0, 0.0]),
+    "jump": ([0.0, 1.0, 1.000001, 2.0], [0.0, 1.0, 1.0, 0.0], [1.0, 1.0, -1.0, -1.0]),
+    "late": ([1e6, 1e6 + 1.0], [0.0, 0.9], [0.0, 0.0]),
+}
+
+
+@pytest.mark.parametrize("kind", CURVES)
+def test_key_frames_follow_curves(kind: str) -> None:
+    """A motion of two waypoints may bend, return, and change direction between them."""
+    scene = vkc.load_scene("door")
+    knots, offsets, slopes = map(np.array, CURVES[kind])
+    direction = np.linspace(-1.0, 1.0, len(scene.start))
+    positions = scene.start + np.outer(offsets, direction)
+    curve = Curve(knots, positions, np.outer(slopes, direction))
+    names, ends = scene.robot.coordinates.names, [0, -1]
+    phases = (vkc.PhaseSpan("move", 0, 1),)
+    motion = vkc.Trajectory(names, knots[ends], positions[ends], phases, len(names), curve)
+    world = World(scene)
+    at = np.linspace(knots[0], knots[-1], 1001)
+    shown, truth = interpolate_key_frames(world, motion, at), world.compute_positions(motion, at)
+    np.testing.assert_allclose(shown, truth, atol=5e-3)
+    assert len(sample_motion(world, motion).times) < 60
+
+
+@pytest.mark.parametrize("coordinate", ["base_yaw", "shoulder_pan_joint"])
+def test_key_frames_keep_carried_objects_in_the_hand(coordinate: str) -> None:
+    """Free objects are moved along chords, which must be near the arcs of the hand."""
+    scene = make_room()
+    robot = scene.robot.coordinates.names
+    names = (*robot, "stick.grip_slide", "stick.grip_turn")
+    positions = np.tile([*scene.start, 0.0, 0.0], (2, 1))
+    positions[1, names.index(coordinate)] += 0.9
+    phases = (vkc.PhaseSpan("turn", 0, 1, (vkc.Hold("stick", "grip"),)),)
+    motion = vkc.Trajectory(names, np.array([0.0, 3.0]), positions, phases, len(robot))
+    world, at = World(scene), np.linspace(0.0, 3.0, 301)
+    shown, truth = interpolate_key_frames(world, motion, at), world.compute_positions(motion, at)
+    place = world.get_placement_columns("stick")
+    assert np.ptp(truth[:, place], axis=0).max() > 0.3
+    np.testing.assert_allclose(shown[:, place], truth[:, place], atol=5e-3)
 
 
 def test_placements_equal_those_of_the_world_model(plan: vkc.Plan) -> None:

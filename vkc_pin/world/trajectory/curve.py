@@ -13,7 +13,14 @@ from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import check_array
 from vkc_pin.utils.arrays import Floats, Ints
 
-__all__ = ["MIN_INTERVAL", "Curve", "concatenate_curves", "sample_evenly", "sample_intervals"]
+__all__ = [
+    "MIN_INTERVAL",
+    "Curve",
+    "concatenate_curves",
+    "divide_intervals",
+    "sample_evenly",
+    "sample_intervals",
+]
 
 MIN_INTERVAL = 1e-9
 """Shortest time between knots [s]."""
@@ -228,6 +235,14 @@ def sample_evenly(times: Floats, rate: float) -> Floats:
     """Return times at a rate [Hz] from the first to the last of `times` [s], and the last time."""
     duration = times[-1] - times[0]
     return np.append(times[0] + np.arange(np.ceil(duration * rate - 1e-6)) / rate, times[-1])
+
+
+def divide_intervals(times: Floats, counts: Ints) -> Floats:
+    """Return times [s], and those that divide each interval evenly into `counts` parts."""
+    starts = np.repeat(np.cumsum(counts) - counts, counts)
+    part = np.arange(counts.sum()) - starts
+    inside = np.repeat(times[:-1], counts) + part * np.repeat(np.diff(times) / counts, counts)
+    return np.append(inside, times[-1])
 
 
 def sample_intervals(knots: Floats, shares: Floats, *, last: bool = False) -> Floats:

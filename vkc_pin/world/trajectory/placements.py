@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Bools, Floats
+from vkc_pin.utils.arrays import Bools, Floats, Ints
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.curve import divide_intervals
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
@@ -16,6 +18,12 @@ __all__ = ["Motion", "key_times", "sample_motion"]
 
 # Largest step between key frames [rad], [m]; beyond π an interpolated rotation would reverse.
 _TURN = 1.0
+# The same while free objects are carried, which a viewer moves along chords: arcs with a radius of
+# 1.5 m are up to 1.5·0.15²/8 = 4 mm away from theirs.
+_CARRYING_TURN = 0.15
+# Distance of a curve from straight lines between key frames [rad], [m]: at 1 m from a joint, as
+# much as a pixel shows of a room.
+_BEND = 0.005
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,27 +60,74 @@ class Motion:
 
 
 def key_times(trajectory: Trajectory, strides: Mapping[str, float] | None = None) -> Floats:
-    """Return waypoint times and intermediate times at most 1 rad or m apart, shape (K,) [s].
+    """Return the times of key frames between which a viewer may interpolate, shape (K,) [s].
 
-    Between these times a viewer's interpolation of joint positions and quaternions is exact.
+    They include all waypoints. Without a curve, interpolated joint positions and quaternions are
+    exact; a curve is up to 5 mm or 5 mrad away from them.
+
+    Args:
+        trajectory: The motion.
+        strides: Coordinate → its largest step between key frames [rad], [m]. Default: 1.
     """
-    most = [(strides or {}).get(name, _TURN) for name in trajectory.names]
-    steps = np.abs(np.diff(trajectory.positions, axis=0) / most).max(axis=1)
-    counts = np.maximum(1, np.ceil(steps)).astype(int)
-    edges = zip(trajectory.times[:-1], trajectory.times[1:], counts, strict=True)
-    return np.concatenate(
-        [*(np.linspace(a, b, n, endpoint=False) for a, b, n in edges), trajectory.times[-1:]]
-    )
+    most = np.array([(strides or {}).get(name, _TURN) for name in trajectory.names])
+    curve, waypoints = trajectory.curve, trajectory.times
+    if curve is None:
+        speeds = np.abs(trajectory.velocities())
+        return divide_intervals(waypoints, _count_pieces(waypoints, speeds, 0.0 * speeds, most))
+    speeds, accelerations = curve.compute_max_rates()
+    first = np.searchsorted(curve.times, waypoints[:-1])  # knots that are waypoints
+    speeds_between = np.maximum.reduceat(speeds, first)
+    accelerations_between = np.maximum.reduceat(accelerations, first)
+    counts = _count_pieces(waypoints, speeds_between, accelerations_between, most)
+    counts_of_cubics = _count_pieces(curve.times, speeds, accelerations, most)
+    # Where velocities jump within a short cubic, it takes less to divide every cubic alone.
+    divides_cubics = np.add.reduceat(counts_of_cubics, first) < counts
+    is_edge = np.repeat(divides_cubics, np.diff([*first, len(speeds)]))
+    counts_of_cubics[first] = np.where(divides_cubics, counts_of_cubics[first], counts)
+    is_edge[first] = True
+    edges = np.append(curve.times[:-1][is_edge], curve.times[-1])
+    return divide_intervals(edges, counts_of_cubics[is_edge])
+
+
+def _count_pieces(times: Floats, speeds: Floats, accelerations: Floats, most: Floats) -> Ints:
+    """Return into how many pieces to divide each interval between times, shape (K − 1,).
+
+    Args:
+        times: Shape (K,) [s].
+        speeds: Largest ones in each interval, shape (K − 1, n).
+        accelerations: Largest ones in each interval, shape (K − 1, n).
+        most: Largest step of each coordinate, shape (n,).
+    """
+    durations = np.diff(times)[:, None]
+    steps = durations * speeds / most
+    # A function f is up to h²/8·max |f″| away from a line through two of its points, h apart.
+    bends = durations * np.sqrt(accelerations / (8.0 * _BEND))
+    counts = np.ceil(np.maximum(steps, bends).max(axis=1) - 1e-9)
+    return np.maximum(counts, 1.0).astype(int)
 
 
 def sample_motion(
-    world: World, trajectory: Trajectory | None, times: Floats | None = None
+    world: World,
+    trajectory: Trajectory | None,
+    times: Floats | None = None,
+    *,
+    step: float | None = None,
 ) -> Motion:
-    """Sample a motion at `times`, (K,) [s], or at key times; without a motion, the start."""
+    """Sample a motion; without a motion, return the start.
+
+    Args:
+        world: The scene as one tree.
+        trajectory: The motion.
+        times: Shape (K,) [s]. Default: those of key frames.
+        step: Largest step between key frames [rad], [m]. Default: what a viewer needs.
+    """
     if trajectory is None:
         times, rows = np.zeros(1), world.start[None]
     else:
-        steps = world.coordinates.compute_max_steps(_TURN, _TURN).tolist()
+        if step is None:
+            carries = _carries_free_objects(world.scene, trajectory)
+            step = _CARRYING_TURN if carries else _TURN
+        steps = world.coordinates.compute_max_steps(step, step).tolist()
         strides = dict(zip(world.coordinates.names, steps, strict=True))
         times = key_times(trajectory, strides) if times is None else np.asarray(times, float)
         rows = world.compute_positions(trajectory, times)
@@ -91,3 +146,9 @@ def sample_motion(
     return Motion(
         np.asarray(times), local, placements, tools, placements[:, 1, :3, 3].copy(), moving
     )
+
+
+def _carries_free_objects(scene: Scene, trajectory: Trajectory) -> bool:
+    """Return whether a free object is held, or may lie on something that is moved."""
+    is_free = any(placed.object.free for placed in scene.objects.values())
+    return is_free and any(phase.holds for phase in trajectory.phases)

@@ -309,6 +309,16 @@ def test_number_of_points_is_limited(plan: vkc.Plan) -> None:
         plan.to_ros(rate=1.1e6 / duration / len(plan.scene.start))
 
 
+def test_motions_too_long_for_a_message_are_rejected() -> None:
+    """Seconds are signed integers of 32 bits."""
+    rows = np.array([np.zeros(3), np.ones(3)])
+    last = 2.0**31 - 1.0
+    message = make_motion(np.array([5.0, last + 5.0]), rows).to_ros()
+    assert message["points"][-1]["time_from_start"] == {"sec": int(last), "nanosec": 0}
+    with expect_error("motion: too long .*less than 2.31"):
+        make_motion(np.array([5.0, last + 7.0]), rows).to_ros()
+
+
 @pytest.mark.parametrize("rate", [1.0, 25.0])
 @pytest.mark.parametrize("derivatives", [0, 1, 2])
 def test_rests_keep_their_duration_at_any_rate(rate: float, derivatives: int) -> None:

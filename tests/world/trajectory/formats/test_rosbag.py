@@ -129,6 +129,8 @@ def test_existing_folder_is_replaced_only_with_force(plan: Plan, tmp_path: Path)
         ({"states": -1.0}, "states"),
         ({"namespace": "/a b"}, "namespace"),
         ({"frame": 1}, "frame"),
+        ({"states": 1e9}, "states"),
+        ({"stamp": 2.0**31 - 5.0}, "stamp"),  # the motion takes 6 s
     ],
 )
 def test_invalid_arguments_are_rejected(
@@ -137,6 +139,12 @@ def test_invalid_arguments_are_rejected(
     with expect_error(field=field):
         plan.to_rosbag(tmp_path / "bag", **options)
     assert not list(tmp_path.iterdir())
+
+
+def test_recordings_may_end_in_the_last_second_of_ros(plan: Plan, tmp_path: Path) -> None:
+    found = read_bag(plan.to_rosbag(tmp_path / "bag", stamp=2.0**31 - 6.5))
+    when, _ = found["/vkc/base/cmd_vel"][-1]
+    assert 1e-9 * when == pytest.approx(2.0**31 - 0.5)
 
 
 def test_missing_package_names_the_extra(

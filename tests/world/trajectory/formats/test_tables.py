@@ -95,6 +95,72 @@ def test_plain_tables_are_read(tmp_path: Path) -> None:
     assert vkc.Trajectory.from_csv(tmp_path / "own.csv", robot_size=4).robot_size == 4
 
 
+def remove_columns(table: str, *removed: str) -> str:
+    """Return a table without the columns whose names end so."""
+    rows = list(csv.reader(table.splitlines()))
+    kept = [k for k, name in enumerate(rows[0]) if not name.endswith(removed)]
+    return "".join(",".join(row[k] for k in kept) + "\n" for row in rows)
+
+
+@pytest.mark.parametrize("joints", ["robot", ["base_x", "base_y", "base_yaw"], "all"])
+def test_velocities_need_no_marks_of_waypoints(
+    door_plan: vkc.Plan, tmp_path: Path, joints: Any
+) -> None:
+    """They are no coordinates of their own; every line is a waypoint then."""
+    text = door_plan.to_csv(tmp_path / "all.csv", joints=joints).read_text()
+    bare = remove_columns(text, "waypoint", "phase", "phase_name", "held")
+    size = len(door_plan.to_ros(joints=joints)["joint_names"])
+    found = vkc.Trajectory.from_csv(write_text_file(tmp_path / "bare.csv", bare))
+    motion = door_plan.trajectory
+    assert found.names == motion.names[:size]
+    np.testing.assert_array_equal(found.times, motion.curve.times)
+    at = np.linspace(0.0, motion.times[-1], 300)
+    np.testing.assert_allclose(found.at(at), motion.at(at)[:, :size], atol=1e-12)
+    half = write_text_file(tmp_path / "half.csv", remove_columns(text, "base_y velocity [m/s]"))
+    with expect_error("half.csv:1: not the velocities of its coordinates"):
+        vkc.Trajectory.from_csv(half)
+
+
+def test_columns_may_have_names_of_others(tmp_path: Path) -> None:
+    names = ("base_x", "base_y", "base_yaw", "lift", "phase", "waypoint")
+    rows = np.arange(12.0).reshape(2, 6)
+    phases = (vkc.PhaseSpan("go", 0, 1),)
+    motion = vkc.Trajectory(names, np.array([0.0, 1.0]), rows, phases, 6)
+    assert are_equal(vkc.Trajectory.from_csv(motion.to_csv(tmp_path / "odd.csv")), motion)
+
+
+HELD = '"{""door"": ""handle""}"'
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        (f"2.0,0,0,0,1,go,{HELD}", "bad.csv:4: phase: phase 1 is another .*or the number 2"),
+        ("2.0,0,0,0,1,turn,{}", "bad.csv:4: phase: phase 1 is another .*'go'.*'turn'"),
+    ],
+)
+def test_changed_lines_inside_a_phase_are_rejected(
+    tmp_path: Path, changed: str, message: str
+) -> None:
+    """Grasps that are edited in some lines of a phase would else have no effect."""
+    rows = [ROW, "1.0,0,0,0,1,go,{ }\n", changed + "\n", "3.0,0,0,0,1,go,{}\n"]
+    with expect_error(message):
+        vkc.Trajectory.from_csv(write_text_file(tmp_path / "bad.csv", HEADER + "".join(rows)))
+    rows[2:] = [f"2.0,0,0,0,2,go,{HELD}\n", f"3.0,0,0,0,2,go,{HELD}\n"]
+    file = write_text_file(tmp_path / "good.csv", HEADER + "".join(rows))
+    found = vkc.Trajectory.from_csv(file)
+    assert [(phase.first, phase.last) for phase in found.phases] == [(0, 1), (1, 3)]
+
+
+def test_changed_knots_inside_a_phase_are_rejected(door_plan: vkc.Plan, tmp_path: Path) -> None:
+    """Lines that are no waypoints count as well."""
+    table = door_plan.to_csv(tmp_path / "door.csv").read_text().splitlines(keepends=True)
+    line = next(k for k, row in enumerate(table) if ",0,1,reach door.handle" in row)
+    table[line] = table[line].replace("{}", HELD)
+    with expect_error(rf"bad.csv:{line + 1}: phase: phase 1 is another"):
+        vkc.Trajectory.from_csv(write_text_file(tmp_path / "bad.csv", "".join(table)))
+
+
 HEADER = "time [s],base_x [m],base_y [m],base_yaw [rad],phase,phase_name,held\n"
 ROW = "0.0,0,0,0,1,go,{}\n"
 

@@ -14,9 +14,14 @@ import numpy as np
 
 from vkc_pin.errors import InputError, UnknownNameError, format_value
 from vkc_pin.utils.arguments import check_bool, check_integer, check_number, check_text, is_number
-from vkc_pin.utils.arrays import Bools, Floats, Ints
+from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.world.files.resources import check_path
-from vkc_pin.world.trajectory.curve import MIN_INTERVAL, Curve, sample_evenly
+from vkc_pin.world.trajectory.curve import (
+    MIN_INTERVAL,
+    Curve,
+    divide_intervals,
+    sample_evenly,
+)
 from vkc_pin.world.trajectory.formats.interpolation import interpolate_points
 from vkc_pin.world.trajectory.formats.tables import (
     infer_robot_size,
@@ -25,11 +30,13 @@ from vkc_pin.world.trajectory.formats.tables import (
     select_columns,
 )
 
-__all__ = ["from_ros", "sample_states", "to_ros"]
+__all__ = ["MOST_SECONDS", "from_ros", "sample_states", "to_ros"]
 
 _MAX_VALUES = 1_000_000  # positions in a message: some 300 MB
 _NANO = 1_000_000_000
 _MOST_TIME = 2**32  # [s] and [ns]: ROS has 32 bits for each
+MOST_SECONDS = 2**31
+"""Times of messages are less [s]: their seconds are signed integers of 32 bits."""
 _ROWS = ("positions", "velocities", "accelerations")  # of a point
 _LARGEST = 1e12  # [m], [rad] and their derivatives
 
@@ -75,7 +82,7 @@ def to_ros(
     Raises:
         UnknownNameError: There is no such group or coordinate.
         InputError: `joints` is empty or repeats a name; `rate`, `derivatives` or `stamp` is out of
-            range.
+            range, or the motion is too long for a message.
     """
     smooth = check_bool(smooth, "smooth")
     frame = check_text(frame, "frame")
@@ -84,16 +91,14 @@ def to_ros(
         derivatives = 1 if is_smooth else 0
     derivatives = check_integer(derivatives, "derivatives", low=0, high=2)
     stamp = check_number(stamp, "stamp", "seconds, at least 0", low=0.0)
-    if stamp >= 2.0**31:
-        expected = "seconds, less than 2^31"
-        raise InputError("out of range", field="stamp", expected=expected, got=stamp)
     columns = select_columns(motion, joints)
     knots = _get_knots(motion)[0]
+    _check_times(stamp, float(knots[-1]))
     moments = knots
     if rate is not None:
         rate = _check_rate(rate, knots, len(columns))
         counts = np.maximum(np.ceil(np.diff(knots) * rate - 1e-6), 1.0)
-        moments = _divide_intervals(knots, counts.astype(int))
+        moments = divide_intervals(knots, counts.astype(int))
     if is_smooth:
         curve = _make_curve(motion, columns)
     else:
@@ -141,7 +146,7 @@ def sample_states(
     """
     columns = select_columns(motion, joints)
     knots = _get_knots(motion)[0]
-    rate = _check_rate(rate, knots, len(columns))
+    rate = _check_rate(rate, knots, len(columns), field="states")
     is_rest = _find_rests(motion, knots)
     rests = knots[np.append(is_rest, False) | np.append(False, is_rest)]
     even = sample_evenly(knots, rate)
@@ -273,23 +278,25 @@ def _find_rests(motion: Mapping[str, Any], times: Floats) -> Bools:
     return np.asarray(is_still[np.searchsorted(knots, middles) - 1])
 
 
-def _check_rate(rate: float, times: Floats, columns: int) -> float:
-    rate = check_number(rate, "rate", "points a second, more than 0", low=0.0, strict=True)
+def _check_times(stamp: float, duration: float) -> None:
+    """Check that a message can state the times of its header and of its last point [s]."""
+    expected = "seconds, less than 2^31"
+    if stamp >= MOST_SECONDS:
+        raise InputError("out of range", field="stamp", expected=expected, got=stamp)
+    if duration >= MOST_SECONDS:
+        problem = "too long for a message of ROS"
+        raise InputError(problem, field="motion", expected=expected, got=f"{duration:g}")
+
+
+def _check_rate(rate: float, times: Floats, columns: int, *, field: str = "rate") -> float:
+    rate = check_number(rate, field, "points a second, more than 0", low=0.0, strict=True)
     most = _MAX_VALUES // max(columns, 1)  # a group may be empty
     duration = times[-1] - times[0]
     if duration * rate > most:
         expected = f"at most {most} points, {most / duration:.4g} a second "
         expected += f"for this motion of {duration:.4g} s"
-        raise InputError("too many points", field="rate", expected=expected, got=rate)
+        raise InputError("too many points", field=field, expected=expected, got=rate)
     return rate
-
-
-def _divide_intervals(times: Floats, counts: Ints) -> Floats:
-    """Divide the interval after each of the times but the last evenly into `counts` parts."""
-    starts = np.repeat(np.cumsum(counts) - counts, counts)
-    part = np.arange(counts.sum()) - starts
-    inside = np.repeat(times[:-1], counts) + part * np.repeat(np.diff(times) / counts, counts)
-    return np.append(inside, times[-1])
 
 
 def _round_times(times: Floats) -> Floats:

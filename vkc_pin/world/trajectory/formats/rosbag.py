@@ -21,7 +21,7 @@ from vkc_pin.utils.arguments import check_number, check_text
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.optional_imports import import_optional
 from vkc_pin.world.files.writing import write_folder_atomically
-from vkc_pin.world.trajectory.formats.ros import sample_states, to_ros
+from vkc_pin.world.trajectory.formats.ros import MOST_SECONDS, sample_states, to_ros
 
 __all__ = ["TOPICS", "import_rosbags", "write_rosbag"]
 
@@ -133,6 +133,11 @@ def _make_messages(
     """Yield suffix of the topic, time of recording [ns] and message."""
     base = to_ros(motion, joints="base", rate=rate, frame=frame, stamp=stamp)
     begin = _count_nanoseconds(base["header"]["stamp"])
+    duration = _count_nanoseconds(base["points"][-1]["time_from_start"])
+    if begin + duration >= MOST_SECONDS * _NANO:
+        problem = "the motion ends later than messages of ROS can state"
+        expected = f"seconds, less than 2^31 − {duration / _NANO:.4g}"
+        raise InputError(problem, field="stamp", expected=expected, got=stamp)
     arm = to_ros(motion, joints="arm", rate=rate, frame=frame, stamp=stamp)
     for end, found in (("arm/joint_trajectory", arm), ("base/joint_trajectory", base)):
         if found["joint_names"]:

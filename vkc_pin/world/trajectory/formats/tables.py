@@ -139,9 +139,10 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
     has_openings = tuple(header[-4:]) == (*_PHASES, _OPENING)
     has_phases = has_openings or tuple(header[-3:]) == _PHASES
     last = len(header) - (len(_PHASES) + has_openings if has_phases else 0)
-    names, is_curve = header[1:last], header[last - 1] == _WAYPOINT and last > 1
+    names, is_curve = header[1:last], _has_rates(header[1:last])
+    is_marked = is_curve and names[-1] == _WAYPOINT
     if is_curve:
-        names = _check_rate_columns(names, path)
+        names = _check_rate_columns(names[: len(names) - is_marked], path)
     own = slice(1, len(names) + 1)
     rows: list[list[float]] = []
     knots: list[list[float]] = []
@@ -156,14 +157,14 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
             _parse_number(cell, path, number, name)
             for cell, name in zip(cells[:last], header, strict=False)
         ]
-        knots.append(row)
-        if is_curve and not row[-1]:
-            continue
-        rows.append(row)
         if has_phases:
             opening = cells[-1] if has_openings else ""
             stated = {_OPENING: _parse_number(opening, path, number, _OPENING)} if opening else {}
-            _add_phase(phases, cells[last : last + 3], stated, len(rows) - 1, path, number)
+            # This row is the next waypoint, or leads there.
+            _add_phase(phases, cells[last : last + 3], stated, len(rows), path, number)
+        knots.append(row)
+        if not is_marked or row[-1]:
+            rows.append(row)
     if not has_phases and len(rows) > 1:
         phases = [make_single_phase(len(rows))]
     if robot_size is None:
@@ -181,7 +182,7 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
         motion["curve"] = {
             "times": [knot[0] for knot in knots],
             "positions": [knot[own] for knot in knots],
-            "rates": [knot[own.stop : -1] for knot in knots],
+            "rates": [knot[own.stop : own.stop + len(names)] for knot in knots],
         }
     return motion
 
@@ -200,10 +201,16 @@ def _check_header(cells: list[str], path: Path) -> list[str]:
     return header
 
 
+def _has_rates(columns: list[str]) -> bool:
+    """Return whether columns have velocities of coordinates, as of a curve."""
+    is_marked = columns[-1:] == [_WAYPOINT] and any(name.endswith(_RATE) for name in columns)
+    return is_marked or any(name == columns[0] + _RATE for name in columns)
+
+
 def _check_rate_columns(columns: list[str], path: Path) -> list[str]:
     """Return the coordinates of a curve's columns, which are followed by their velocities."""
-    half = (len(columns) - 1) // 2
-    names, rates = columns[:half], columns[half:-1]
+    half = len(columns) // 2
+    names, rates = columns[:half], columns[half:]
     expected = [name + _RATE for name in names]
     if rates != expected:
         raise InputError(
@@ -317,15 +324,34 @@ def _add_phase(
     path: Path,
     line: int,
 ) -> None:
-    """Parse a line's phase cells (number, name, holds) and add or extend the phase."""
+    """Parse a line's phase cells (number, name, holds) and add or extend the phase.
+
+    A waypoint between two phases belongs to the earlier one. All lines of a phase must agree.
+    """
     number, name, held = cells
     expected = f"{len(phases)} or {len(phases) + 1}" if phases else "1"
     if number not in expected.split(" or "):
         problem, got = "not the next phase", format_value(number)
         raise InputError(problem, file=path, line=line, field="phase", expected=expected, got=got)
-    if int(number) == len(phases):
-        phases[-1]["last"] = row
+    details = {"name": name, **_parse_holds(held, path, line), **opening}
+    if int(number) > len(phases):
+        phases.append({**details, "first": max(row - 1, 0), "last": row})
         return
+    phases[-1]["last"] = row
+    known = {key: value for key, value in phases[-1].items() if key not in ("first", "last")}
+    if details != known:
+        raise InputError(
+            f"phase {number} is another one in the lines before",
+            file=path,
+            line=line,
+            field="phase",
+            expected=f"{format_value(known)}, or the number {int(number) + 1}",
+            got=format_value(details),
+        )
+
+
+def _parse_holds(held: str, path: Path, line: int) -> dict[str, Any]:
+    """Return the holds of a phase as in a motion's data."""
     try:
         items = json.loads(held).items()
         rows = {name: [hold, None] if isinstance(hold, str) else hold for name, hold in items}
@@ -342,6 +368,4 @@ def _add_phase(
             expected=expected,
             got=format_value(held),
         ) from None
-    first = max(row - 1, 0)
-    details = {"held": at, "by": by, **({"deviation": deviation} if deviation else {}), **opening}
-    phases.append({"name": name, "first": first, "last": row, **details})
+    return {"held": at, "by": by, **({"deviation": deviation} if deviation else {})}

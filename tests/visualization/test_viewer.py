@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import html
 import itertools
@@ -365,6 +366,55 @@ def test_pages_that_do_not_read_are_disconnected(
         assert count_received(late, size) >= size, "a new page gets the scene"
 
 
+def test_small_commands_do_not_fill_the_memory(
+    fresh_server: tuple[subprocess.Popen[bytes], str, int],
+) -> None:
+    """A waiting command takes 2 kB besides its own bytes, and its page is soon disconnected."""
+    _, address, port = fresh_server
+    size, count = 1000, 30_000
+    with connect_page(port) as deaf:
+        send_objects(address, count, size)
+        assert count_received(deaf, size * count) < size * count
+
+
+def test_many_pages_that_do_not_read_are_disconnected(
+    fresh_server: tuple[subprocess.Popen[bytes], str, int],
+) -> None:
+    """Each alone may have 64 MB of waiting commands, but not all of them."""
+    process, address, port = fresh_server
+    before = read_memory(process)
+    with contextlib.ExitStack() as stack:
+        pages = [stack.enter_context(connect_page(port)) for _ in range(20)]
+        send_objects(address, 12, 4_000_000)
+        assert read_memory(process) - before < 700_000_000
+        reader = stack.enter_context(connect_page(port))
+        assert count_received(reader, 4_000_000) >= 4_000_000
+        received = [count_received(page, 48_000_000) >= 48_000_000 for page in pages]
+    assert 5 < sum(received) < 20, "only as many as necessary"
+
+
+def test_closed_pages_do_not_delay_others(tmp_path: Path) -> None:
+    """The commands that waited for them are forgotten, without a traceback for each."""
+    log = tmp_path / "log"
+    command = [sys.executable, "-P", "-u", str(visualization.__file__).replace("viewer", "server")]
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with log.open("wb") as errors, subprocess.Popen(command, **pipes, stderr=errors) as process:
+        assert process.stdout is not None
+        found = [process.stdout.readline().decode().partition("=")[2] for _ in range(2)]
+        address, web = (text.strip() for text in found)
+        with connect_page(int(re.findall(r":(\d+)", web)[0])):
+            send_objects(address, 300, 100_000)
+        for _ in range(50):
+            time.sleep(0.1)
+            if b"closed" in log.read_bytes():
+                break
+        send_objects(address, 1, 100)
+        process.kill()
+    assert b"opened" in log.read_bytes()
+    assert b"closed" in log.read_bytes()
+    assert b"exception" not in log.read_bytes()
+
+
 def test_pages_may_be_late_and_get_large_commands(
     fresh_server: tuple[subprocess.Popen[bytes], str, int],
 ) -> None:
@@ -619,7 +669,10 @@ vkc.viewer.scene_tree.find(["meshcat", "paths"]).object.traverse((part) => {
     heights.push(part.localToWorld(point).project(camera).y);
   }
 });
+const isCut = (part) => part.scrollWidth > part.clientWidth;
+const texts = [...document.querySelectorAll("#phase, #headline, #because, #note")];
 return {
+  cut: texts.filter(isCut).map((part) => part.id),
   width: innerWidth, phase: phase.width * phase.height, right: bar.right, lowest: bar.bottom,
   text: document.getElementById("phase").textContent, about: about.right,
   panel: panel ? getComputedStyle(panel).display : "none",
@@ -644,8 +697,45 @@ def test_page_fits_screens_of_telephones(page: Path, size: tuple[int, int]) -> N
         assert found["filled"] > 0.7, "of 2: the paths extend along the height"
 
 
+@needs_chromium
+@pytest.mark.browser
+@pytest.mark.parametrize("size", [(390, 844), (1280, 720)])
+def test_long_names_are_shown_whole(plan: Plan, tmp_path: Path, size: tuple[int, int]) -> None:
+    """Those of phases have a line of their own on telephones; others are broken anywhere."""
+    first, *others = plan.trajectory.phases
+    name = "move door.hinge, door.knob, ünter"
+    trajectory = dataclasses.replace(
+        plan.trajectory, phases=(dataclasses.replace(first, name=name), *others)
+    )
+    scene = dataclasses.replace(plan.scene, name="living_room_" * 12)
+    report = dataclasses.replace(plan.report, notes=("no_break_" * 20,))
+    longer = dataclasses.replace(plan, scene=scene, trajectory=trajectory, report=report)
+    found = open_at(visualization.to_html(longer, tmp_path / "long.html"), *size, LOOK)
+    assert found["text"] == name
+    assert found["cut"] == []
+    assert found["about"] <= size[0]
+
+
+@needs_chromium
+@pytest.mark.browser
+def test_short_motions_have_a_slider_and_a_clock(plan: Plan, tmp_path: Path) -> None:
+    motion = plan.trajectory
+    shorter = dataclasses.replace(motion, times=motion.times / 1000.0)
+    page = visualization.to_html(
+        dataclasses.replace(plan, trajectory=shorter), tmp_path / "short.html"
+    )
+    script = """const slider = document.getElementById("time");
+    slider.value = 0.0043;
+    slider.dispatchEvent(new Event("input"));
+    return { time: vkc.time(), clock: document.getElementById("clock").textContent };"""
+    found = open_at(page, 800, 600, script)
+    assert found["time"] == pytest.approx(0.0043)
+    assert found["clock"] == "0.004 / 0.006 s"
+
+
 PLAY = """
-// Frames of a slow machine: one every 700 ms.
+// Frames of a slow machine, at these times in milliseconds, after which the speed changes.
+const script = STEPS;
 let frames = [];
 const stamps = [];
 window.requestAnimationFrame = (call) => { frames.push(call); return 0; };
@@ -654,11 +744,14 @@ while (frames.length < 2) {  // those of the page and of MeshCat, requested befo
 }
 vkc.show(0);
 vkc.play(true);
-for (let k = 0; k < 5; k++) {
+for (const [time, speed] of script) {
   const due = frames;
   frames = [];
-  due.forEach((call) => call(10000 + 700 * k));
+  due.forEach((call) => call(10000 + time));
   stamps.push(vkc.time());
+  if (speed === "hide") document.dispatchEvent(new Event("visibilitychange", { bubbles: true }));
+  else if (speed === "again") { vkc.play(false); vkc.play(true); }
+  else if (speed) document.getElementById("speed").value = speed;
 }
 return { stamps };
 """
@@ -666,6 +759,26 @@ return { stamps };
 
 @needs_chromium
 @pytest.mark.browser
-def test_slow_frames_do_not_slow_the_motion(page: Path) -> None:
-    stamps = open_at(page, 800, 600, PLAY)["stamps"]
-    assert stamps == pytest.approx([0.0, 0.7, 1.4, 2.1, 2.8])
+@pytest.mark.parametrize(
+    ("steps", "expected"),
+    [
+        ([(700 * k, "") for k in range(5)], [0.0, 0.7, 1.4, 2.1, 2.8]),
+        (
+            [(0, "2"), (500, "0.25"), (900, "4"), (1000, "1"), (1100, "")],
+            [0.0, 1.0, 1.1, 1.5, 1.6],
+        ),
+        # A hidden page gets no frames, and goes on where it was.
+        ([(0, ""), (500, "hide"), (90_000, ""), (90_400, "")], [0.0, 0.5, 0.5, 0.9]),
+        # The end is shown for 2 s, also after the motion was started again there.
+        (
+            [(0, "4"), (1500, ""), (3400, "again"), (3500, ""), (5000, ""), (6900, ""), (7100, "")],
+            [0.0, 6.0, 6.0, 0.0, 6.0, 6.0, 0.0],
+        ),
+    ],
+)
+def test_motions_are_played_in_real_time(
+    page: Path, steps: list[tuple[int, str]], expected: list[float]
+) -> None:
+    """Slow frames do not slow the motion down."""
+    stamps = open_at(page, 800, 600, PLAY.replace("STEPS", json.dumps(steps)))["stamps"]
+    assert stamps == pytest.approx(expected)

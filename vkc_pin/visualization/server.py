@@ -10,8 +10,8 @@ import re
 import sys
 import threading
 import urllib.parse
+from typing import Any
 
-import tornado.iostream
 import tornado.web
 import tornado.websocket
 import umsgpack  # type: ignore[import-untyped]
@@ -22,7 +22,9 @@ from meshcat.servers.zmqserver import ZMQWebSocketBridge
 LOOPBACK = "127.0.0.1"
 _PATIENCE = 5.0  # [s] until a command gets an error for an answer
 _MAX_MESSAGE = 2**28  # [bytes]
-_MAX_BACKLOG = 2**26  # [bytes] of commands that wait for a page
+_MAX_BACKLOG = 2**26  # [bytes] of commands that wait for a page, besides the scene
+_MAX_WAITING = 2**29  # [bytes] of commands that wait for all pages
+_OVERHEAD = 2500  # [bytes] that a waiting command takes, as measured with tornado 6.6
 _MAX_DEPTH = 50  # of the tree of shown objects, which is walked recursively
 _is_here = re.compile(r"(localhost|127\.0\.0\.1|\[::1\])(:\d+)?", re.IGNORECASE).fullmatch
 
@@ -108,14 +110,12 @@ class LoopbackBridge(ZMQWebSocketBridge):
 
     def send_scene(self, page):  # type: ignore[no-untyped-def]
         """Send all that is shown to a new page."""
-        super().send_scene(page)
-        parts = [
-            part
-            for node in walk(self.tree)
-            for part in (node.object, node.transform, node.animation, *node.properties)
-            if part is not None
-        ]
-        page.most_waiting = sum(map(len, parts)) + _MAX_BACKLOG
+        page.waiting = 0
+        for node in walk(self.tree):
+            for part in (node.object, *node.properties, node.transform, node.animation):
+                if part is not None:
+                    self._send(page, part)
+        page.most_waiting = page.waiting + _MAX_BACKLOG
 
     def forward_to_websockets(self, frames):  # type: ignore[no-untyped-def]
         """Send a command to all open pages; skip closed ones, so that the sender gets an answer.
@@ -123,17 +123,29 @@ class LoopbackBridge(ZMQWebSocketBridge):
         Pages that do not read, as in a suspended browser, are disconnected: what waits for them
         would fill the memory. A page that has read everything gets commands of any size.
         """
-        for page in tuple(self.websocket_pool):
-            if page.ws_connection is None:
-                continue
-            stream = page.ws_connection.stream
-            stream.max_write_buffer_size = page.most_waiting if stream.writing() else None
-            try:
-                page.write_message(frames[2], binary=True)
-            except tornado.websocket.WebSocketClosedError:
-                pass
-            except tornado.iostream.StreamBufferFullError:
-                stream.close()
+        pages = [page for page in self.websocket_pool if page.ws_connection is not None]
+        pages.sort(key=lambda page: page.waiting)
+        total = sum(page.waiting for page in pages)
+        while pages and (pages[-1].waiting > pages[-1].most_waiting or total > _MAX_WAITING):
+            slowest = pages.pop()
+            total -= slowest.waiting
+            slowest.ws_connection.stream.close()
+        for page in pages:
+            self._send(page, frames[2])
+
+    def _send(self, page, data: bytes) -> None:  # type: ignore[no-untyped-def]
+        """Send data to a page, and count them until they are sent."""
+        size = len(data) + _OVERHEAD
+
+        def forget(sent: Any) -> None:
+            page.waiting -= size
+            sent.exception()  # of closed pages: asyncio would log each that nobody looks at
+
+        page.waiting += size
+        try:
+            page.write_message(data, binary=True).add_done_callback(forget)
+        except tornado.websocket.WebSocketClosedError:
+            page.waiting -= size
 
 
 def _end_with_parent() -> None:

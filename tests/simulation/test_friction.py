@@ -80,7 +80,7 @@ def test_slipping_object_is_lost() -> None:
     result = plan_drawer().simulate(grasp="friction", physics=physics)
     assert not result.ok
     assert result.grips[0].broken is not None
-    assert result.grips[0].slip > 0.005
+    assert result.grips[0].slip > 0.003  # until the pads lose contact
     assert any("drawer.slide" in line for line in result.problems())
 
 

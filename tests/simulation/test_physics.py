@@ -9,9 +9,10 @@ import coal
 import numpy as np
 import pinocchio as pin
 import pytest
-from helpers.executions import make_grasping_scene, plan_drawer
+from helpers.executions import make_grasping_scene, make_stationary_motion, plan_drawer
 
 import vkc_pin as vkc
+from vkc_pin.simulation.execution import simulate
 from vkc_pin.simulation.physics import complete_inertias, import_mujoco
 from vkc_pin.world.trajectory.world_model import World
 
@@ -67,3 +68,16 @@ def test_missing_mass_is_estimated_from_volume_with_a_note() -> None:
     assert world.model.inertias[joint].mass == pytest.approx(500.0 * volume, rel=0.02)
     assert "base" in note
     assert "500 kg/m³" in note
+
+
+def test_resting_stick_does_not_roll() -> None:
+    """A stick that rests on the rims of two discs stays where it is, with any version of MuJoCo."""
+    scene = vkc.load_scene("init_1")
+    motion = make_stationary_motion(scene, 4.0)
+    x, y, yaw = scene.start[:3].tolist()
+    result = simulate(scene, [vkc.GoTo(x, y, yaw)], motion)
+    before = scene.objects["stick"].placement
+    after = World(scene).get_placement("stick", result.rows[-1])
+    off = pin.log6(before.actInv(after)).vector
+    assert np.abs(off[:3]).max() < 2e-3
+    assert np.abs(off[3:]).max() < 2e-3

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from vkc_pin.errors import InputError
+from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.utils.arguments import check_integer, check_mapping, check_number, check_text
 from vkc_pin.world.scene.hold import Hold, check_hold_order, make_holds
 
-__all__ = ["PhaseSpan", "get_required"]
+__all__ = ["PhaseSpan", "check_fields", "get_required"]
+
+_FIELDS = ("name", "first", "last", "held", "by", "deviation", "opening")
 
 
 @dataclass(frozen=True)
@@ -76,16 +78,25 @@ class PhaseSpan:
         Raises:
             InputError: A field is missing or invalid.
         """
-        phase = check_mapping(data, where)
+        phase = check_fields(check_mapping(data, where), _FIELDS, where)
         held = make_holds(
-            get_required(phase, "held"), phase.get("by"), deviation=phase.get("deviation")
+            get_required(phase, "held", where), phase.get("by"), deviation=phase.get("deviation")
         )
-        name, first, last = (get_required(phase, key) for key in ("name", "first", "last"))
+        name, first, last = (get_required(phase, key, where) for key in ("name", "first", "last"))
         return cls(name, first, last, held, phase.get("opening"))
 
 
-def get_required(data: Mapping[str, Any], name: str) -> Any:
+def check_fields(data: Mapping[str, Any], known: Collection[str], where: str) -> Mapping[str, Any]:
+    """Return data of a motion. Raises `UnknownNameError` if `where` has another field."""
+    for name in data:
+        if name not in known:
+            raise UnknownNameError("field", str(name), known, field=where or None)
+    return data
+
+
+def get_required(data: Mapping[str, Any], name: str, where: str = "") -> Any:
     """Return an entry of a motion's data. Raises `InputError` if it is missing."""
     if name not in data:
-        raise InputError("this is missing from a trajectory", field=name)
+        field = ".".join(part for part in (where, name) if part)
+        raise InputError("this is missing from a trajectory", field=field)
     return data[name]

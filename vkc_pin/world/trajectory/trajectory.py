@@ -25,10 +25,11 @@ from vkc_pin.utils.arguments import (
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.trajectory.curve import Curve, sample_evenly
 from vkc_pin.world.trajectory.formats import ros, rosbag, tables
-from vkc_pin.world.trajectory.phase_span import PhaseSpan, get_required
+from vkc_pin.world.trajectory.phase_span import PhaseSpan, check_fields, get_required
 
 __all__ = ["Trajectory"]
 
+_FIELDS = ("names", "times", "positions", "robot_size", "phases", "curve")
 MOST_SAMPLES = 1_000_000
 """Largest number of samples of a motion."""
 
@@ -275,6 +276,7 @@ class Trajectory:
         """
         if not isinstance(data, Mapping):
             raise InputError("not a trajectory", expected="an object", got=type(data).__name__)
+        check_fields(data, _FIELDS, "")
         listed: tuple[Any, ...] = check_list(
             get_required(data, "phases"), "phases", "a list of phases"
         )
@@ -284,12 +286,9 @@ class Trajectory:
         )
         curve = data.get("curve")
         if curve is not None:
-            curve = Curve(
-                *(
-                    get_required(check_mapping(curve, "curve"), key)
-                    for key in ("times", "positions", "rates")
-                )
-            )
+            parts = ("times", "positions", "rates")
+            knots = check_fields(check_mapping(curve, "curve"), parts, "curve")
+            curve = Curve(*(get_required(knots, key, "curve") for key in parts))
         return cls(names, times, positions, tuple(phases), size, curve)
 
     def to_csv(self, path: str | Path, **options: Any) -> Path:

@@ -433,6 +433,31 @@ def test_names_that_do_not_fit_are_rejected(plan: vkc.Plan) -> None:
         vkc.Trajectory.from_ros(plan.to_ros(joints="base"), like=plan.trajectory)
 
 
+@pytest.mark.parametrize("kind", ["slower", "delayed", "stopped", "ends"])
+def test_messages_with_other_times_than_phases_are_rejected(
+    door_plan: vkc.Plan, tmp_path: Path, kind: str
+) -> None:
+    """Grasps would else begin somewhere on the way."""
+    motion = door_plan.trajectory
+    message = motion.to_ros(joints="all")
+    times = read_times(message)
+    if kind == "ends":
+        message["points"] = [message["points"][k] for k in (0, -1)]
+    elif kind == "stopped":
+        message["points"] = message["points"][:40]
+    else:
+        changed = 2.0 * times if kind == "slower" else times + 0.7
+        for point, time in zip(message["points"], changed.tolist(), strict=True):
+            sec, nanosec = divmod(round(time * 1e9), 10**9)
+            point["time_from_start"] = {"sec": sec, "nanosec": nanosec}
+    expected = f"points: there are no points at the times.*{motion.times[-1]:.2f}"
+    with expect_error(expected):
+        vkc.Trajectory.from_ros(message, like=motion)
+    file = write_text_file(tmp_path / "sent.json", json.dumps(message))
+    with expect_error(f"sent.json: {expected}"):
+        vkc.Trajectory.from_ros(file, like=motion)
+
+
 def test_exported_knots_describe_the_same_motion(door_plan: vkc.Plan) -> None:
     """Clearances hold at waypoints, so knots between them must not become waypoints."""
     motion = door_plan.trajectory

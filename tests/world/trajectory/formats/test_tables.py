@@ -6,6 +6,7 @@ import csv
 import json
 import re
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -246,6 +247,27 @@ def test_large_and_deep_files_are_rejected_quickly(
 def test_invalid_json_is_rejected(tmp_path: Path, text: str, message: str) -> None:
     with expect_error(message):
         vkc.Trajectory.from_json(write_text_file(tmp_path / "bad.json", text))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: t["phases"][1].update(openning=0.04), r"phases\[1\]: .*'openning'.*'opening'"),
+        (lambda t: t["phases"][0].pop("held"), r"trajectory.phases\[0\].held: this is missing"),
+        (lambda t: t["curve"].update(rate=[]), "trajectory.curve: .*'rate'; did you mean 'rates'"),
+        (lambda t: t["curve"].pop("times"), "trajectory.curve.times: this is missing"),
+        (lambda t: t.update(robotsize=9), "trajectory: .*'robotsize'; did you mean 'robot_size'"),
+        (lambda t: t.update(curves=t.pop("curve")), "trajectory: .*'curves'.*'curve'"),
+    ],
+)
+def test_misspelt_fields_of_edited_plans_are_rejected(
+    door_plan: vkc.Plan, tmp_path: Path, change: Callable[[Any], Any], message: str
+) -> None:
+    """They would have no effect, and lines would replace a curve."""
+    data = json.loads(door_plan.to_json(tmp_path / "door.json").read_text())
+    change(data["trajectory"])
+    with expect_error(f"bad.json: .*{message}"):
+        vkc.Trajectory.from_json(write_text_file(tmp_path / "bad.json", json.dumps(data)))
 
 
 def test_export_of_a_saved_plan(

@@ -181,9 +181,9 @@ def from_ros(
 
     Raises:
         UnknownNameError: `like` has no such coordinate.
-        InputError: A field is missing or invalid, coordinates of the robot are missing, or two
-            neighbouring points have accelerations, but not both have velocities: ros2_controllers
-            4.42.1 commands the position 0 between them.
+        InputError: A field is missing or invalid, coordinates of the robot are missing, no point is
+            near the end of a phase of `like`, or two neighbouring points have accelerations, but
+            not both have velocities: ros2_controllers 4.42.1 commands the position 0 between them.
     """
     file = None
     if not isinstance(message, Mapping):
@@ -211,7 +211,7 @@ def from_ros(
     positions: Floats = np.reshape(stated, (len(points), len(names)))
     waypoints = list(range(len(points)))
     if like is not None:
-        waypoints, phases = _place_phases(np.array(times), like, has_curve)
+        waypoints, phases = _place_phases(np.array(times), like, has_curve, file)
     else:
         phases = [make_single_phase(len(points))] if len(points) > 1 else []
     motion = {
@@ -231,7 +231,7 @@ def from_ros(
 
 
 def _place_phases(
-    times: Floats, like: Mapping[str, Any], has_curve: bool
+    times: Floats, like: Mapping[str, Any], has_curve: bool, file: Path | None
 ) -> tuple[list[int], list[dict[str, Any]]]:
     """Return the points that are waypoints, and the phases of another motion between them."""
     moments = np.array(like["times"], float)
@@ -242,8 +242,17 @@ def _place_phases(
         waypoints = np.union1d(at, waypoints[[0, -1]])
         at = np.searchsorted(waypoints, at)
     edges = at[[0, *(phase["last"] for phase in like["phases"])]].tolist()
-    ends = zip(like["phases"], edges, edges[1:], strict=False)
-    phases = [{**phase, "first": first, "last": last} for phase, first, last in ends]
+    ends = moments[[phase["last"] for phase in like["phases"]]] - moments[0]
+    if edges[-1] != len(waypoints) - 1 or (np.diff(edges) <= 0).any():
+        raise InputError(
+            "there are no points at the times at which the phases of `like` end",
+            file=file,
+            field="points",
+            expected=f"points at {format_value(ends.round(3).tolist())} s",
+            got=f"{len(times)} points from {times[0]:.3f} to {times[-1]:.3f} s",
+        )
+    spans = zip(like["phases"], edges, edges[1:], strict=False)
+    phases = [{**phase, "first": first, "last": last} for phase, first, last in spans]
     return waypoints.tolist(), phases
 
 

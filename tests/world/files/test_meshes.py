@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import subprocess
 import sys
 import tracemalloc
 import warnings
@@ -31,6 +32,35 @@ CORNERS = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (
 
 
 VERTICES = ["\n".join(f"v {x + 2 * k} {y} {z}" for x, y, z in CORNERS) + "\n" for k in range(2)]
+
+
+INTERRUPTED = """
+import signal, sys
+import numpy, coal
+
+class Finder:
+    def find_spec(self, name, *rest):
+        if name == "networkx":  # trimesh catches everything that is raised here
+            sys.meta_path.remove(self)
+            signal.raise_signal(signal.SIGINT)
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.meta_path.insert(0, Finder())
+from vkc_pin.world.files.meshes import load_mesh
+from vkc_pin.world.models.shapes import triangulate
+assert "trimesh" not in sys.modules
+try:
+    print("not interrupted", CALL)
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+
+
+@pytest.mark.parametrize("call", ["load_mesh('no.obj')", "triangulate(coal.Sphere(1.0))"])
+def test_interrupts_during_imports_are_not_lost(call: str) -> None:
+    code = [sys.executable, "-c", INTERRUPTED.replace("CALL", call)]
+    done = subprocess.run(code, capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == "interrupted\n"
 
 
 def format_faces(first: int, corner: str = "{}") -> str:

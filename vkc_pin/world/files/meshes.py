@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.utils.arrays import MAX_COORDINATE, Floats, Ints
+from vkc_pin.utils.interrupt import defer_interrupt
 from vkc_pin.world.files.collada import read_collada
 from vkc_pin.world.files.gltf import GLTF_SUFFIXES, GLTF_TO_Z_UP, check_gltf
 from vkc_pin.world.files.hulls import SHEET_THICKNESS, compute_hull, compute_outer_hull, thicken
@@ -89,7 +90,9 @@ def load_mesh(
         InputError: There is no such file, or it is not a valid mesh.
         UnknownNameError: The file has no such submesh.
     """
-    import trimesh
+    # trimesh catches Ctrl-C while it imports others, and would go on without them.
+    with defer_interrupt():
+        import trimesh
 
     file = check_path(path, "path", "a mesh file")
     factors = _check_scale(file, scale)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arrays import Bools, Floats, Ints
+from vkc_pin.utils.interrupt import defer_interrupt
 from vkc_pin.world.collision.distances import compute_distance
 from vkc_pin.world.collision.solids import convert_solid, flatten_placements
 from vkc_pin.world.files.meshes import get_triangles
@@ -145,7 +146,9 @@ def triangulate(shape: coal.CollisionGeometry) -> tuple[Floats, NDArray[np.int64
     Returns:
         Vertices, shape (n, 3) [m], and faces, shape (m, 3).
     """
-    import trimesh.creation as make
+    # trimesh catches Ctrl-C while it imports others, and would go on without them.
+    with defer_interrupt():
+        import trimesh.creation as make
 
     if isinstance(shape, coal.Box):
         mesh = make.box(extents=2.0 * np.asarray(shape.halfSide))

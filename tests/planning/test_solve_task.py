@@ -5,10 +5,11 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import pytest
 from helpers.carrying import describe_box, describe_table, lift, make_room
-from helpers.drawers import SHORT
+from helpers.drawers import SHORT, replace_scene_fields
 from helpers.drives import make_hall
 from helpers.gates import make_gate_problem
 from helpers.small_problems import load_door_scene
@@ -117,6 +118,45 @@ def test_coarse_phases_are_repaired_by_closing_the_chain() -> None:
     assert result.problem.task.phases == task.phases
     assert result.problem.drift(result.z) > 2.0, "relative to the tolerance, between waypoints"
     assert result.phase_waypoints().phases == tuple(phase.key for phase in task.phases)
+
+
+@pytest.mark.parametrize(("begin", "end"), [(2, 8), (3, 12), (4, 8), (6, 12)])
+def test_segments_double_until_the_motion_holds_between_waypoints(begin: int, end: int) -> None:
+    """The hand is to move on a line; turned in equal parts, joints leave it between waypoints."""
+    scene = replace_scene_fields(make_hall(), robot={"name": "husky_ur5e", "base": "fixed"})
+    goal = scene.tool_placement()
+    first = goal.translation.copy()
+    goal.translation = first + np.array([0.35, -0.5, 0.0])
+    across = np.array([0.5, 0.35, 0.0]) / np.hypot(0.5, 0.35)
+    line = vkc.Constraint(
+        "line",
+        lambda s: ca.dot(across, s.position("tool") - first),
+        lower=-0.002,
+        upper=0.002,
+        tolerance=1e-4,
+    )
+
+    def reach(refinements: int) -> vkc.Plan:
+        options = vkc.Options(reach_waypoints=begin, max_refinements=refinements, max_restarts=1)
+        return vkc.plan(
+            scene, [vkc.Reach(goal)], options=options, terms=[line], initialization="interpolated"
+        )
+
+    def count_segments(plan: vkc.Plan) -> int:
+        return len(plan.trajectory.times) - 1
+
+    coarse = reach(0)
+    assert (coarse.status, count_segments(coarse)) == ("rejected", begin)
+    assert {one.constraint for one in coarse.report.violations} == {"term"}
+    once = reach(1)
+    assert (once.success, count_segments(once)) == (end == 2 * begin, 2 * begin)
+    enough = reach(vkc.Options().max_refinements)
+    assert enough.success, enough.summary()
+    assert count_segments(enough) == end
+    assert enough.metrics["rounds"] > coarse.metrics["rounds"]
+    times = np.linspace(0.0, enough.trajectory.times[-1], 200)
+    hand = np.array([enough.pose(None, time).translation for time in times])
+    assert np.abs((hand - first) @ across).max() <= 0.002 + 10 * 1e-4
 
 
 def test_infeasible_solution_with_the_least_shortfall_is_returned() -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 import trimesh
 
@@ -285,6 +286,55 @@ def test_errors_in_the_geometry_and_in_includes_are_raised(
     trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "there.stl")
     with pytest.raises(InputError, match=message):
         compile_door(tmp_path, **parts)
+
+
+@pytest.mark.parametrize(
+    "turn",
+    [
+        'quat="0.7071068 0 0.7071068 0"',
+        'quat="0.1 -0.5 0.7 0.5"',
+        'euler="20 -40 75"',
+        'axisangle="1 2 3 50"',
+        'xyaxes="0 1 0 -1 0 0"',
+        'zaxis="1 1 0"',
+    ],
+)
+@pytest.mark.parametrize("products", ["0 0 0", "0.03 -0.02 0.01", "-0.05 0 0"])
+def test_full_inertias_beside_any_orientation_are_those_of_mujoco_without_it(
+    tmp_path: Path, turn: str, products: str
+) -> None:
+    mujoco = pytest.importorskip("mujoco")
+    frame = '<body name="frame" pos="1 2 3" euler="10 20 30"><geom size=".1" mass="2"/>{}</body>'
+    leaf = (
+        '<body name="leaf" pos=".5 0 0"><joint name="hinge"/><geom size=".2"/><inertial '
+        f'pos=".1 -.2 .3" mass="3" {{}} fullinertia="0.11 0.2 0.25 {products}"/></body>'
+    )
+    text = f"<mujoco><worldbody>{frame.format(leaf)}</worldbody></mujoco>"
+    expected = mujoco.MjModel.from_xml_string(text.format(""))
+    with pytest.raises(ValueError, match="fullinertia"):
+        mujoco.MjModel.from_xml_string(text.format(turn))
+    (tmp_path / "leaf.xml").write_text(text.format(turn))
+    found, notes = compile_mjcf(tmp_path / "leaf.xml")
+    assert "settings of MuJoCo 2" in " ".join(notes)
+    np.testing.assert_allclose(found.body_mass, expected.body_mass)
+    np.testing.assert_allclose(found.body_ipos, expected.body_ipos)
+    for body in range(found.nbody):
+        turned, plain = (
+            compute_tensor(model.body_iquat[body], model.body_inertia[body])
+            for model in (found, expected)
+        )
+        np.testing.assert_allclose(turned, plain, atol=1e-12)
+    xx, yy, zz = 0.11, 0.2, 0.25
+    xy, xz, yz = map(float, products.split())
+    stated = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
+    np.testing.assert_allclose(turned, stated, atol=1e-9)
+
+
+def compute_tensor(quaternion: np.ndarray, moments: np.ndarray) -> np.ndarray:
+    """Return the inertia of a body about its centre of mass in its own axes [kg m²]."""
+    w, x, y, z = quaternion
+    axes = pin.Quaternion(w, x, y, z).matrix()
+    return axes @ np.diag(moments) @ axes.T
 
 
 def test_full_inertias_keep_their_axes_beside_an_orientation(tmp_path: Path) -> None:

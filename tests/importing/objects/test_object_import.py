@@ -182,6 +182,40 @@ def test_resistances_that_hold_a_joint_are_clipped_with_a_note(
 
 
 @pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize("name", ["damping", "friction"])
+@pytest.mark.parametrize(
+    ("text", "used", "stated"),
+    [("inf", 1e4, "inf"), ("+INF", 1e4, "inf"), ("-inf", 0.0, "-inf"), ("-3", 0.0, "-3")],
+)
+def test_infinite_and_negative_resistances_are_clipped_with_a_note(
+    tmp_path: Path, kind: str, name: str, text: str, used: float, stated: str
+) -> None:
+    found = vkc.importing.import_object(write_door(tmp_path, kind, **{name: text}), tmp_path / "o")
+    resistance = found.object.resistance["hinge"]
+    other = "friction" if name == "damping" else "damping"
+    assert (getattr(resistance, name), getattr(resistance, other)) == (used, 0.0)
+    note = f"joint 'hinge' states a {name} of {stated}: {used:g} is used"
+    assert [one for one in found.notes if "is used" in one] == [note]
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_resistances_that_are_no_numbers_are_refused(tmp_path: Path, kind: str) -> None:
+    file = write_door(tmp_path, kind, damping="nan")
+    with pytest.raises(vkc.InputError, match=r"hinge: dynamics damping: .*got nan") as found:
+        vkc.importing.import_object(file, tmp_path / "out")
+    assert found.value.file == file
+
+
+def test_infinite_numbers_other_than_resistances_and_limits_are_none(tmp_path: Path) -> None:
+    file = write_door(tmp_path, "sdf")
+    dense = '<link name="leaf"><inertial auto="true"><density>inf</density></inertial>'
+    file.write_text(file.read_text().replace('<link name="leaf">', dense))
+    found = vkc.importing.import_object(file, tmp_path / "out")
+    assert found.object.mass == 0.0
+    assert any("density: wrong numbers" in note and "got inf" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
 def test_errors_about_generated_files_name_the_given_file(tmp_path: Path, kind: str) -> None:
     """The generated files are gone when the error is read."""
     near = {"urdf": 'xyz="1 0 0"', "xml": 'pos="1 0 0"', "sdf": "<pose>1 0 0"}[kind]

@@ -50,7 +50,7 @@ def test_swapped_limits_and_unsupported_joints_are_noted(tmp_path: Path) -> None
     joint = found.joints["b"]
     assert joint.limits == (-0.5, 1.0)
     assert np.allclose(joint.axis, [1.0, 0.0, 0.0])
-    assert (joint.damping, joint.friction) == (0.4, 0.0)
+    assert (joint.damping, joint.friction) == (0.4, -1.0)
     assert found.joints["c"].kind == "fixed"
     for words in ("lower limit above its upper limit", "floating", "mimics"):
         assert words in " ".join(found.notes)

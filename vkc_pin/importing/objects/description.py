@@ -219,20 +219,21 @@ class Description:
         return not any(link.inertia.mass > 0.0 for link in self.links.values())
 
     def clip_resistances(self) -> Description:
-        """Return the object with resistances of joints up to `MAX_COORDINATE`, noting larger ones.
+        """Return the object with resistances of joints from 0 to `MAX_COORDINATE`, noting others.
 
-        Larger ones state that a joint does not move.
+        Larger ones, also infinite ones, state that a joint does not move. Negative ones would
+        drive it.
         """
         joints, notes = dict(self.joints), list(self.notes)
         for child, joint in self.joints.items():
-            stated = {name: getattr(joint, name) for name in _RESISTANCES}
-            for name, value in stated.items():
-                if value > MAX_COORDINATE:
-                    about = f"a {name} of {value:g}: {MAX_COORDINATE:g} is used"
+            clipped = dict[str, Any]()
+            for name in _RESISTANCES:
+                stated = getattr(joint, name)
+                used = min(max(stated, 0.0), MAX_COORDINATE)
+                if used != stated and not math.isnan(stated):
+                    about = f"a {name} of {stated:g}: {used:g} is used"
                     notes.append(f"joint '{joint.name}' states {about}")
-            clipped: dict[str, Any] = {
-                name: min(value, MAX_COORDINATE) for name, value in stated.items()
-            }
+                clipped[name] = used
             joints[child] = replace(joint, **clipped)
         return replace(self, joints=joints, notes=tuple(notes))
 

@@ -484,7 +484,7 @@ class _Reader:
         if (limit := element.find("limit")) is None:
             return None, None
         low, high, velocity = (
-            scope.read_numbers(limit, key, 1, default, name, largest=math.inf)[0]
+            scope.read_numbers(limit, key, 1, default, name, largest=math.inf, is_finite=False)[0]
             for key, default in (("lower", "-1e16"), ("upper", "1e16"), ("velocity", "-1"))
         )
         if low > high:
@@ -503,13 +503,13 @@ class _Reader:
         if (dynamics := element.find("dynamics")) is None:
             return {}
         damping, friction, stiffness, rest = (
-            scope.read_numbers(dynamics, key, 1, "0", name, largest=math.inf)[0]
+            scope.read_numbers(dynamics, key, 1, "0", name, largest=math.inf, is_finite=False)[0]
             for key in ("damping", "friction", "spring_stiffness", "spring_reference")
         )
         return {
-            "damping": max(0.0, damping),
-            "friction": max(0.0, friction),
-            "stiffness": max(0.0, stiffness),
+            "damping": damping,
+            "friction": friction,
+            "stiffness": stiffness,
             "springref": rest,
         }
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -257,13 +256,14 @@ class Scope:
         where: str,
         *,
         largest: float = MAX_COORDINATE,
+        is_finite: bool = True,
     ) -> tuple[float, ...]:
-        """Return the numbers of a child element; "inf" becomes 1e308."""
+        """Return the numbers of a child element, infinite ones only without `is_finite`."""
         found = element.find(key)
-        text = None if found is None else re.sub(r"\binf\b", "1e308", found.text or "", flags=re.I)
+        text = None if found is None else found.text or ""
         named = f"{where}: {element.tag} {key}"
         holder = element if found is None else found
-        return self._parse(holder, text, count, default, named, largest)
+        return self._parse(holder, text, count, default, named, largest, is_finite=is_finite)
 
     def _parse(
         self,
@@ -273,12 +273,21 @@ class Scope:
         default: str | None,
         where: str,
         largest: float = MAX_COORDINATE,
+        *,
+        is_finite: bool = True,
     ) -> tuple[float, ...]:
         text = text if text is None or text.strip() else None  # an empty element is a default
         holder = ElementTree.Element(element.tag, {} if text is None else {"text": text})
         try:
             return parse_numbers(
-                self.file, holder, "text", count, default=default, where=where, largest=largest
+                self.file,
+                holder,
+                "text",
+                count,
+                default=default,
+                where=where,
+                largest=largest,
+                is_finite=is_finite,
             )
         except InputError as error:
             raise make_element_error(

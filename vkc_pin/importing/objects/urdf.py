@@ -192,7 +192,11 @@ def _make_placement(origin: tuple[tuple[float, ...], tuple[float, ...]]) -> pin.
 
 
 def _parse_resistance(file: Path, dynamics: ElementTree.Element, key: str, name: str) -> float:
-    return parse_numbers(file, dynamics, key, 1, default="0", where=name, largest=math.inf)[0]
+    """Return a resistance of a joint, which may be infinite."""
+    (value,) = parse_numbers(
+        file, dynamics, key, 1, default="0", where=name, largest=math.inf, is_finite=False
+    )
+    return value
 
 
 def _read_joint(
@@ -210,7 +214,7 @@ def _read_joint(
         )
     dynamics = element.find("dynamics")
     resistance = {
-        key: 0.0 if dynamics is None else max(0.0, _parse_resistance(file, dynamics, key, name))
+        key: 0.0 if dynamics is None else _parse_resistance(file, dynamics, key, name)
         for key in ("damping", "friction")
     }
     ends = [

@@ -217,6 +217,7 @@ def parse_numbers(
     default: str | None,
     where: str,
     largest: float = MAX_COORDINATE,
+    is_finite: bool = True,
 ) -> tuple[float, ...]:
     """Return `count` numbers of an attribute.
 
@@ -228,6 +229,7 @@ def parse_numbers(
         default: Text for a missing attribute; None: the attribute is required.
         where: Link or joint of the element, for messages.
         largest: Largest valid magnitude.
+        is_finite: Whether infinite numbers are invalid.
     """
     text = element.get(key, default)
     parts = (text or "").split()
@@ -239,9 +241,8 @@ def parse_numbers(
         values = tuple(map(float, parts))
     except ValueError:
         values = ()
-    if len(values) != count or not all(
-        math.isfinite(value) and abs(value) <= largest for value in values
-    ):
+    is_valid = len(values) == count and all(abs(value) <= largest for value in values)
+    if not is_valid or (is_finite and not all(map(math.isfinite, values))):
         field, expected = (
             f"{where}: {element.tag} {key}",
             f"{count} finite numbers with spaces between them" if count > 1 else "1 finite number",

@@ -104,6 +104,69 @@ def test_overlaps_and_close_pairs_are_reported(tmp_path: Path) -> None:
         found.plot(tmp_path / "scene.txt")
 
 
+def test_close_pairs_of_the_robot_are_measured_nearest_first() -> None:
+    """The robot's body is 0.99 m long and 0.67 m wide."""
+    scene = load_drawer_scene().with_start(base=[-0.8, 0.5, 0.0])
+    size = (0.1, 0.1, 0.4)
+    boxes = {
+        "left": (size, (-0.8, 0.5 + 0.335 + 0.05 + 0.015, 0.2)),
+        "front": (size, (-0.8 + 0.495 + 0.05 + 0.005, 0.5, 0.2)),
+        "right": (size, (-0.8, 0.5 - 0.335 - 0.05 - 0.010, 0.2)),
+        "far": (size, (-0.8 - 0.495 - 0.05 - 0.021, 0.5, 0.2)),
+    }
+    found = check_scene(keep_attachment(add_boxes(scene, **boxes), "drawer", "handle"))
+    assert [pair[:2] for pair in found.robot] == [
+        ("base_link", "front"),
+        ("base_link", "right"),
+        ("base_link", "left"),
+    ]
+    distances = [pair.distance for pair in found.robot]
+    np.testing.assert_allclose(distances, [0.005, 0.010, 0.015], atol=1e-4)
+    assert "the robot is closer than 20 mm to" in str(found)
+
+
+def test_clearance_of_the_options_decides_what_is_close_and_exempt() -> None:
+    beside = ((0.6, 0.1, 0.9), (2.0, 0.295 + 0.05 + 0.03, 0.45))
+    scene = keep_attachment(add_boxes(load_drawer_scene(), side=beside), "drawer", "handle")
+    usual = check_scene(scene)
+    assert usual.allowed == usual.close == ()
+    more = check_scene(scene, options=vkc.Options(dist_safe=0.05))
+    assert [(one.first, one.second) for one in more.allowed] == [("drawer.tray", "side")]
+    (pair,) = more.close
+    assert pair.distance == pytest.approx(0.03, abs=1e-6)
+    text = str(more)
+    assert "closer than 50 mm to each other" in text
+    assert "one in the other" not in text
+
+
+def test_overlapping_objects_are_listed_apart_from_close_ones() -> None:
+    boxes = {
+        "inside": ((0.6, 0.1, 0.9), (2.0, 0.295 + 0.05 - 0.004, 0.45)),
+        "beside": ((0.6, 0.1, 0.9), (2.0, -0.295 - 0.05 - 0.004, 0.45)),
+    }
+    with pytest.warns(UserWarning, match="inside"):
+        scene = add_boxes(load_drawer_scene(), **boxes)
+    lines = check_scene(keep_attachment(scene, "drawer", "handle")).lines()
+    close, overlapping, after = (
+        next(k for k, line in enumerate(lines) if title in line)
+        for title in ("to each other", "one in the other", "may be close")
+    )
+    assert close < overlapping < after
+    assert [line for line in lines[close:overlapping] if "beside" in line]
+    assert not [line for line in lines[close:overlapping] if "inside" in line]
+    assert [line for line in lines[overlapping:after] if "inside" in line]
+    assert not [line for line in lines[overlapping:after] if "beside" in line]
+
+
+def test_reported_clearance_is_that_of_what_is_not_grasped() -> None:
+    """The closed hand is 5.3 mm from the cup; other grasps of the same sample are closer."""
+    scene = load_cup_scene("side")
+    (one,) = check_scene(scene).attachments
+    assert one.clearance > vkc.Options().dist_safe
+    (other,) = check_scene(scene, seed=1).attachments
+    assert not np.array_equal(one.configuration, other.configuration)
+
+
 def make_small_arena() -> Scene:
     arena = {"x": [-1.2, -0.4], "y": [0.1, 0.9]}
     fields = {"arena": arena, "start_region": arena, "objects": []}

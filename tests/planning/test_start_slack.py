@@ -45,7 +45,7 @@ def test_all_ways_to_state_a_start_accept_the_same(beyond: float, is_upper: bool
         np.testing.assert_array_equal(again.start, start.start)
 
 
-@pytest.mark.parametrize("beyond", [START_SLACK + 1e-6, 0.02, 1.0, np.inf, np.nan])
+@pytest.mark.parametrize("beyond", [START_SLACK + 1e-6, 0.0101, 1.0, np.inf, np.nan])
 def test_all_ways_to_state_a_start_refuse_the_same(beyond: float) -> None:
     scene = vkc.load_scene("door")
     arm = measure_wrist(scene, beyond)
@@ -150,3 +150,36 @@ def test_joint_outside_may_only_come_back(
     saved = vkc.Plan(scene, tuple(steps), vkc.Options(), motion, report, "rejected")
     theirs = [one for one in judge(saved.save(tmp_path / "p.npz")).found if one.rule == "limit"]
     assert bool(theirs) != is_valid
+
+
+def make_drawer_motion(
+    wrist: float, slide: list[float]
+) -> tuple[Scene, list[vkc.Step], vkc.Trajectory]:
+    """Return a motion of the drawer beside the robot, whose wrist is `wrist` beyond its limit."""
+    scene = load_drawer_scene()
+    steps: list[vkc.Step] = [vkc.Actuate("drawer", {"slide": 0.3})]
+    names = (*scene.robot.coordinates.names, "drawer.slide")
+    rows = np.zeros((len(slide), len(names)))
+    rows[:, :-1] = scene.start
+    rows[:, 3 + WRIST] = scene.robot.upper[3 + WRIST] + wrist
+    rows[:, -1] = slide
+    phases = (vkc.PhaseSpan("move", 0, len(slide) - 1),)
+    times = 2.0 * np.arange(len(slide))
+    return scene, steps, vkc.Trajectory(names, times, rows, phases, len(names) - 1)
+
+
+@pytest.mark.parametrize(
+    ("wrist", "slide", "outside"),
+    [
+        (0.0, [0.0, 0.1, 0.2], set()),
+        (-0.1, [-0.005, 0.1, 0.2], set()),
+        (-0.1, [-0.005, -0.005, 0.2], {"drawer.slide"}),
+        (0.02, [0.0, 0.1, 0.2], {"wrist_3_joint"}),
+    ],
+)
+def test_only_joints_of_the_robot_may_stay_outside_and_no_further_than_the_slack(
+    wrist: float, slide: list[float], outside: set[str]
+) -> None:
+    report = vkc.validate(*make_drawer_motion(wrist, slide))
+    found = {one.subject for one in report.violations if one.constraint == "limit"}
+    assert found == outside, report.lines()

@@ -101,8 +101,10 @@ def test_stub_lists_the_public_names() -> None:
     names: dict[str, object] = {}
     exec("from vkc_pin import *", names)
     assert {name for name in names if name != "__builtins__"} == set(vkc.__all__)
-    with pytest.raises(AttributeError, match="plann"):
+    with pytest.raises(AttributeError, match="plann") as caught:
         vkc.plann  # type: ignore[attr-defined]  # noqa: B018
+    # Python finds the nearest name with these two.
+    assert (caught.value.name, caught.value.obj) == ("plann", vkc)
 
 
 @pytest.mark.parametrize("package", ["datasets", "importing", "procedural"])

@@ -5,6 +5,7 @@ Scientific Python has it), so that `import vkc_pin` costs little in a process th
 it, and type checkers see everything.
 """
 
+import sys
 from typing import Any
 
 import lazy_loader
@@ -28,7 +29,12 @@ def __getattr__(name: str) -> Any:
         return globals().setdefault(name, kinematics)
     if name != "__version__":
         with explain_unfit_libraries():
-            return _public(name)
+            try:
+                return _public(name)
+            except AttributeError as error:
+                error.name = name  # so that Python names the nearest attribute
+                error.obj = sys.modules[__name__]
+                raise
     from importlib.metadata import PackageNotFoundError, version  # takes longer than all the rest
 
     try:

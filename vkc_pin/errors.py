@@ -22,6 +22,9 @@ _MAX_NAME_LENGTH = 80
 
 
 class _ShortRepr(reprlib.Repr):
+    def repr_float64(self, x: float, level: int) -> str:
+        return repr(float(x))  # NumPy's numbers as Python's
+
     def repr_int(self, x: int, level: int) -> str:
         bits = x.bit_length()  # Python refuses to write out very large ones
         return repr(x) if bits <= 256 else f"an integer of {bits} bits"

@@ -37,6 +37,23 @@ def test_new_scene_runs(run: RunCommand, capsys: pytest.CaptureFixture[str]) -> 
     assert (folder / "plan.html").is_file()
 
 
+def test_a_folder_stands_for_its_scene(run: RunCommand) -> None:
+    run("new mine")
+    file = Path("mine/scene.yaml")
+    scenes = [vkc.load_scene(path) for path in ("mine", Path("mine"), file)]
+    assert len({str(scene.file) for scene in scenes}) == 1
+    assert run("check mine").code == 0
+    before = file.read_bytes()
+    result = run("plan mine --set drawer.slide=0.1 --save mine/scene.yaml")
+    assert result.code == 2
+    assert "another file than SCENE" in result.err
+    assert file.read_bytes() == before
+    assert run("plan mine --set drawer.slide=0.1").code == 0
+    Path("empty").mkdir()
+    with pytest.raises(vkc.InputError, match="there is no scene 'empty'"):
+        vkc.load_scene("empty")
+
+
 def test_new_does_not_overwrite_files(run: RunCommand) -> None:
     Path("plan.py").write_text("mine")
     result = run("new .")

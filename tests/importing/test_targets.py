@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -55,3 +56,18 @@ def test_comment_is_one_line_with_the_text(text: str) -> None:
         assert yaml.load(f"{line}free: false\n", Loader=loader) == {"free": False}
     escaped = line[2:-1].encode("ascii", "backslashreplace")
     assert escaped.decode("unicode_escape") == text
+
+
+@pytest.mark.parametrize(
+    "import_file",
+    [vkc.importing.import_object, vkc.importing.import_robot, vkc.importing.import_home],
+)
+def test_folders_are_named_as_what_cannot_be_imported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, import_file: Callable[[str], object]
+) -> None:
+    """The default target of an import from the current folder has the folder's name."""
+    monkeypatch.chdir(tmp_path)
+    Path("cabinet").mkdir()
+    Path("cabinet/mobility.urdf").touch()
+    with pytest.raises(vkc.InputError, match=r"^cabinet: file: cannot import a folder .*URDF"):
+        import_file("cabinet")

@@ -185,3 +185,13 @@ def test_goals_within_the_tolerance_are_accepted(
 def test_invalid_tolerances_raise(name: str, value: Any) -> None:
     with pytest.raises(InputError, match=name):
         vkc.Tolerances(**{name: value})
+
+
+def test_reports_and_motions_print_in_words(door_plan: vkc.Plan) -> None:
+    assert str(door_plan.report) == "\n".join(door_plan.report.lines())
+    assert "every constraint holds" in str(door_plan.report)
+    motion = door_plan.trajectory
+    assert repr(motion).startswith(f"<Trajectory {motion.times[-1]:.1f} s, {len(motion.times)} way")
+    assert all(phase.name in repr(motion) for phase in motion.phases)
+    with pytest.raises(InputError, match=r"got 99\.5\)$"):
+        door_plan.pose(None, np.float64(99.5))

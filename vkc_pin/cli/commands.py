@@ -120,7 +120,11 @@ def _check_outputs(outputs: Mapping[str, str], **inputs: str) -> None:
                 )
             import_rosbags()
         files[f"--{option}"] = Path(path, "metadata.yaml") if option in _FOLDERS else path
-    check_outputs(files, inputs={name.replace("_", "|"): path for name, path in inputs.items()})
+    read: dict[str, str | Path] = {}
+    for name, path in inputs.items():
+        is_folder = Path(path).is_dir()  # which stands for the scene in it
+        read[name.replace("_", "|")] = Path(path, "scene.yaml") if is_folder else path
+    check_outputs(files, inputs=read)
 
 
 def _write(files: Mapping[str, str], writers: Writers, report: str = "") -> bool:
@@ -324,7 +328,7 @@ def _add_plan(commands: Any) -> None:
         "objects to values, objects and the hand to poses, and the base to places."
     )
     plan = add_command(commands, "plan", "plan a motion", _plan, about)
-    add_option(plan, "scene SCENE", "name of an included scene, or a YAML file")
+    add_option(plan, "scene SCENE", "a YAML file, a folder with scene.yaml, or an included scene")
     about = "another robot: a name, folder, robot.yaml or URDF (default: the scene's)"
     add_option(plan, "--robot ROBOT", about)
     add_steps(plan)

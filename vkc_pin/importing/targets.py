@@ -16,6 +16,7 @@ from vkc_pin.world.files.writing import MANIFEST, check_writable
 __all__ = [
     "add_connection",
     "add_origin",
+    "check_source",
     "check_target",
     "format_comment",
     "format_numbers",
@@ -71,6 +72,17 @@ def add_origin(element: ElementTree.Element, placement: pin.SE3) -> None:
     """Add an <origin> to an element of a URDF."""
     xyz, rpy = placement.translation, pin.rpy.matrixToRpy(placement.rotation)
     ElementTree.SubElement(element, "origin", xyz=format_numbers(xyz), rpy=format_numbers(rpy))
+
+
+def check_source(file: Path, expected: str) -> None:
+    """Check that the file to import is no folder, whose name would be that of the target, too.
+
+    Raises:
+        InputError: It is a folder.
+    """
+    if os.path.isdir(file):  # noqa: PTH112 - False also without permission to look
+        problem = "cannot import a folder"
+        raise InputError(problem, file=file, field="file", expected=expected, got="a folder")
 
 
 def check_target(folder: Path, command: str, *, force: bool) -> None:

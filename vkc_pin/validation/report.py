@@ -166,6 +166,9 @@ class Report:
             *(f"  because {note}" for note in self.notes),
         ]
 
+    def __str__(self) -> str:
+        return "\n".join(self.lines())
+
     def measures(self) -> dict[str, float]:
         """Return metrics: clearance and closure_error [m], and torque [fraction of its limit]."""
         return {

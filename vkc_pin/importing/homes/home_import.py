@@ -33,7 +33,7 @@ from vkc_pin.importing.objects.object_import import read_description
 from vkc_pin.importing.objects.pieces import PieceCache
 from vkc_pin.importing.progress import ImportProgress
 from vkc_pin.importing.scenes import locate_robot, refer_to_robot, write_scene
-from vkc_pin.importing.targets import check_target
+from vkc_pin.importing.targets import check_source, check_target
 from vkc_pin.options import Options
 from vkc_pin.planning.base_paths.reachable_floor import CELL, find_free_floor
 from vkc_pin.utils.arguments import check_bool, check_instance, check_integer, check_number
@@ -146,6 +146,7 @@ def import_home(  # noqa: PLR0913 - keyword options of a public call
     target = (
         check_path(folder, "folder", "a folder") if folder is not None else Path(_choose_name(path))
     )
+    check_source(path, "a URDF, xacro, MJCF or SDF file")
     check_target(target, _COMMAND, force=check_bool(force, "force"))
     srdf_path = None if srdf is None else check_path(srdf, "srdf")
     original = read_description(path, free=True, packages=packages, arguments=arguments)

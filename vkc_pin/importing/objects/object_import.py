@@ -39,7 +39,7 @@ from vkc_pin.importing.progress import ImportProgress
 from vkc_pin.importing.proposals.proposal import Proposals
 from vkc_pin.importing.proposals.propose import propose_attachments
 from vkc_pin.importing.scenes import locate_robot, make_object_scene, refer_to_robot, write_scene
-from vkc_pin.importing.targets import check_target, get_origin_marker
+from vkc_pin.importing.targets import check_source, check_target, get_origin_marker
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import (
     check_bool,
@@ -222,6 +222,7 @@ def import_object(  # noqa: PLR0913 - keyword options of a public call
     given, robot = robot, robot if isinstance(robot, Robot) else load_robot(robot)
     name = _choose_name(path, link)
     target = Path(name) if folder is None else check_path(folder, "folder", "a folder")
+    check_source(path, "a URDF, xacro, MJCF or SDF file")
     check_target(target, _COMMAND, force=check_bool(force, "force"))
     description = read_description(path, packages=packages, arguments=arguments)
     description = (

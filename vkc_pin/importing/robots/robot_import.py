@@ -48,6 +48,7 @@ from vkc_pin.importing.robots.sources import Source, choose_free_name, read_sour
 from vkc_pin.importing.scenes import make_robot_scene, write_scene
 from vkc_pin.importing.targets import (
     add_connection,
+    check_source,
     check_target,
     format_comment,
     get_origin_marker,
@@ -166,6 +167,7 @@ def import_robot(  # noqa: PLR0913 - keyword options of a public call
         key: str(value) for key, value in check_mapping(arguments or {}, "arguments").items()
     }
     srdf_path = None if srdf is None else check_path(srdf, "srdf")
+    check_source(path, "a URDF, xacro or MJCF file")
     check_target(target, "import-robot", force=check_bool(force, "force"))
     # `check_target` allowed replacing it
     with write_folder_atomically(target, force=True, source=path) as staging:

@@ -481,6 +481,8 @@ def _replace_hold(one: Hold, before: Hold | None, hold: Hold) -> Hold:
 def load_scene(name_or_path: str | Path) -> Scene:
     """Load a scene by the name of a file in `scenes`, or by the path of a scene file (.yaml).
 
+    A folder with a `scene.yaml`, as imports write it, stands for that file, before any name.
+
     Movable links that overlap other shapes raise a warning.
 
     Raises:
@@ -490,7 +492,10 @@ def load_scene(name_or_path: str | Path) -> Scene:
     from vkc_pin.world.files.documents import read_yaml
     from vkc_pin.world.scene.scene_file import make_scene_fields
 
-    file = find_file(name_or_path, "scenes", "*.yaml", noun="scene")
+    path = check_path(name_or_path, "scene", "the name of a scene, or a path")
+    file = path / "scene.yaml" if path.is_dir() else path
+    if file == path or not file.is_file():
+        file = find_file(name_or_path, "scenes", "*.yaml", noun="scene")
     return _check_new_scene(Scene(**make_scene_fields(read_yaml(file), file.parent))._with())
 
 

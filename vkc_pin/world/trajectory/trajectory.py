@@ -60,6 +60,10 @@ class Trajectory:
     robot_size: int
     curve: Curve | None = None
 
+    def __repr__(self) -> str:
+        names = ", ".join(phase.name for phase in self.phases)
+        return f"<Trajectory {self.times[-1]:.1f} s, {len(self.times)} waypoints: {names}>"
+
     def __post_init__(self) -> None:
         listed: tuple[Any, ...] = check_list(self.names, "Trajectory.names", "a list of names")
         names = tuple(

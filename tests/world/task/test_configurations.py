@@ -71,6 +71,7 @@ def test_wrong_joints_are_refused(
 
 
 def test_values_within_a_tolerance_of_the_limits_are_allowed() -> None:
+    assert compile_goal(make_hall(), Configure({"elbow_joint": 3.1416}))  # π, rounded
     assert compile_goal(make_hall(), Configure({"elbow_joint": 3.2}, 0.1))
     with expect_error("outside the joint's limits"):
         compile_goal(make_hall(), Configure({"elbow_joint": 3.3}, 0.1))

@@ -15,6 +15,9 @@ from vkc_pin.world.task.steps import Configure, Reach
 
 __all__ = ["check_pose_is_meant", "find_configuration"]
 
+_ROUNDING = 1e-4
+"""Excess of a goal over a limit that is cut off [rad] or [m]. Files round π to 3.1416, and limits to
+3.14159; validation accepts ten times as much at any goal."""
 _Interval = tuple[float, float]
 
 
@@ -100,7 +103,7 @@ def _intersect(scene: Scene, name: str, interval: _Interval, value: float, field
         lower = upper = float(scene.start[column])
         limits = "the place of the fixed base"
     low, high = interval
-    if low > upper + LIMIT_SLACK or high < lower - LIMIT_SLACK:
+    if low > upper + _ROUNDING or high < lower - _ROUNDING:
         expected = f"{lower:g} to {upper:g}" if lower < upper else f"{lower:g}"
         raise InputError(f"outside {limits}", field=field, expected=expected, got=f"{value:.12g}")
     return min(max(low, lower), upper), max(min(high, upper), lower)

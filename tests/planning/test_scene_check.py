@@ -218,13 +218,13 @@ def load_cup_scene(attachment: str) -> Scene:
     [
         # The closed hand is 5.3 mm from the cup's side, and its fingers 8.0 mm from the rest.
         ("side", 0.0052, True),
-        ("side", 0.0058, True),
+        pytest.param("side", 0.0058, True, marks=pytest.mark.long),
         ("side", 0.0062, True),
         ("side", 0.0065, False),
         ("top", 0.0088, True),
         ("top", 0.0092, False),
-        ("oblique", 0.0088, True),
-        ("oblique", 0.0092, False),
+        pytest.param("oblique", 0.0088, True, marks=pytest.mark.long),
+        pytest.param("oblique", 0.0092, False, marks=pytest.mark.long),
     ],
 )
 def test_check_and_plan_demand_the_same_clearance(

@@ -216,7 +216,13 @@ DRAWER_GRASPS = {
 }
 
 
-@pytest.mark.parametrize("steps", DRAWER_GRASPS.values(), ids=DRAWER_GRASPS)
+@pytest.mark.parametrize(
+    "steps",
+    [
+        pytest.param(steps, id=name, marks=[pytest.mark.long] if name == "pushed before" else [])
+        for name, steps in DRAWER_GRASPS.items()
+    ],
+)
 def test_grasp_without_motion_is_measured_when_the_hand_closes(steps: list[vkc.Step]) -> None:
     """No phase holds the drawer: the robot lets go of it at once, and drives away."""
     plan = vkc.plan(vkc.load_scene("drawer"), [*steps, vkc.GoTo(-1.0, 0.5)])

@@ -59,7 +59,11 @@ def make_scene_with_drawer() -> Scene:
         pytest.param(lambda: replace_mass(make_scene_with_held_stick(), "stick", 3.0), id="3 kg"),
         pytest.param(lambda: replace_mass(make_grasping_scene(), "stick", 8.0), id="8 kg"),
         pytest.param(lambda: make_slender(make_scene_with_held_stick(), 2e-3), id="rod of 4 mm"),
-        pytest.param(lambda: vkc.load_scene("household").with_held({"cup": "side"}), id="cup"),
+        pytest.param(
+            lambda: vkc.load_scene("household").with_held({"cup": "side"}),
+            id="cup",
+            marks=pytest.mark.long,
+        ),
         pytest.param(make_scene_with_cup, id="cup on the table", marks=pytest.mark.long),
         pytest.param(make_scene_with_drawer, id="drawer"),
     ],

@@ -33,6 +33,7 @@ def test_crashes_neither_lose_nor_repeat_other_tasks(tmp_path: Path) -> None:
     assert (tmp_path / "2").exists()
 
 
+@pytest.mark.long
 def test_tasks_that_crash_every_process_are_given_up() -> None:
     pytest.importorskip("distributed")
     found = dict(run_tasks(hang, make_tasks(4), jobs=2, dask=True, limit=1.0))
@@ -118,7 +119,10 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.parametrize("processes", [1, 2, 3])
+@pytest.mark.parametrize(
+    "processes",
+    [pytest.param(1, marks=pytest.mark.long), 2, pytest.param(3, marks=pytest.mark.long)],
+)
 def test_ctrl_c_while_workers_start_is_not_lost(processes: int, tmp_path: Path) -> None:
     """Ctrl-C reaches all processes of the terminal. Only the first one takes notice of it."""
     pytest.importorskip("distributed")

@@ -563,7 +563,7 @@ def test_picture_changes_over_time(page: Path) -> None:
 
 @needs_chromium
 @pytest.mark.browser
-@pytest.mark.parametrize("count", [3, 5])
+@pytest.mark.parametrize("count", [3, pytest.param(5, marks=pytest.mark.long)])
 def test_page_counts_the_reasons_that_it_does_not_show(
     plan: Plan, tmp_path: Path, count: int
 ) -> None:
@@ -683,7 +683,7 @@ return {
 
 @needs_chromium
 @pytest.mark.browser
-@pytest.mark.parametrize("size", [(390, 844), (1280, 720)])
+@pytest.mark.parametrize("size", [(390, 844), pytest.param((1280, 720), marks=pytest.mark.long)])
 def test_page_fits_screens_of_telephones(page: Path, size: tuple[int, int]) -> None:
     found = open_at(page, *size, LOOK)
     assert found["width"] == size[0]
@@ -699,7 +699,7 @@ def test_page_fits_screens_of_telephones(page: Path, size: tuple[int, int]) -> N
 
 @needs_chromium
 @pytest.mark.browser
-@pytest.mark.parametrize("size", [(390, 844), (1280, 720)])
+@pytest.mark.parametrize("size", [(390, 844), pytest.param((1280, 720), marks=pytest.mark.long)])
 def test_long_names_are_shown_whole(plan: Plan, tmp_path: Path, size: tuple[int, int]) -> None:
     """Those of phases have a line of their own on telephones; others are broken anywhere."""
     first, *others = plan.trajectory.phases
@@ -762,13 +762,19 @@ return { stamps };
 @pytest.mark.parametrize(
     ("steps", "expected"),
     [
-        ([(700 * k, "") for k in range(5)], [0.0, 0.7, 1.4, 2.1, 2.8]),
+        pytest.param(
+            [(700 * k, "") for k in range(5)], [0.0, 0.7, 1.4, 2.1, 2.8], marks=pytest.mark.long
+        ),
         (
             [(0, "2"), (500, "0.25"), (900, "4"), (1000, "1"), (1100, "")],
             [0.0, 1.0, 1.1, 1.5, 1.6],
         ),
         # A hidden page gets no frames, and goes on where it was.
-        ([(0, ""), (500, "hide"), (90_000, ""), (90_400, "")], [0.0, 0.5, 0.5, 0.9]),
+        pytest.param(
+            [(0, ""), (500, "hide"), (90_000, ""), (90_400, "")],
+            [0.0, 0.5, 0.5, 0.9],
+            marks=pytest.mark.long,
+        ),
         # The end is shown for 2 s, also after the motion was started again there.
         (
             [(0, "4"), (1500, ""), (3400, "again"), (3500, ""), (5000, ""), (6900, ""), (7100, "")],

@@ -56,7 +56,13 @@ except KeyboardInterrupt:
 """
 
 
-@pytest.mark.parametrize("call", ["load_mesh('no.obj')", "triangulate(coal.Sphere(1.0))"])
+@pytest.mark.parametrize(
+    "call",
+    [
+        "load_mesh('no.obj')",
+        pytest.param("triangulate(coal.Sphere(1.0))", marks=pytest.mark.long),
+    ],
+)
 def test_interrupts_during_imports_are_not_lost(call: str) -> None:
     code = [sys.executable, "-c", INTERRUPTED.replace("CALL", call)]
     done = subprocess.run(code, capture_output=True, text=True, timeout=60, check=True)

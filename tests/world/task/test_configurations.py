@@ -36,11 +36,16 @@ def test_tolerances_are_those_of_the_step() -> None:
     assert wide["elbow_joint"] == (2.5, pytest.approx(np.pi, abs=1e-6))  # the joint's limit
 
 
+@pytest.fixture(scope="module")
+def coupled_scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return write_coupled_scene(tmp_path_factory.mktemp("robot"))
+
+
 @given(leader=st.floats(0.0, 0.4), tolerance=st.floats(0.0, 0.01))
 def test_coupled_joints_are_goals_of_their_leader(
-    tmp_path_factory: pytest.TempPathFactory, leader: float, tolerance: float
+    coupled_scene: Scene, leader: float, tolerance: float
 ) -> None:
-    scene = write_coupled_scene(tmp_path_factory.mktemp("robot"))
+    scene = coupled_scene
     lower, upper = scene.robot.lower, scene.robot.upper
     column = scene.robot.coordinates.index("out_1")
     leader = float(np.clip(leader, lower[column], upper[column]))

@@ -16,8 +16,10 @@ from vkc_pin.world.task.steps import Configure, Reach
 __all__ = ["check_pose_is_meant", "find_configuration"]
 
 _ROUNDING = 1e-4
-"""Excess of a goal over a limit that is cut off [rad] or [m]. Files round π to 3.1416, and limits to
-3.14159; validation accepts ten times as much at any goal."""
+"""Excess of a goal over a limit that is cut off [rad] or [m].
+
+Files round π to 3.1416, and limits to 3.14159; validation accepts ten times as much at any goal.
+"""
 _Interval = tuple[float, float]
 
 

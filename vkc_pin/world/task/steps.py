@@ -268,8 +268,8 @@ class GoTo:
                 )
 
 
-Step = Reach | Grasp | Actuate | Configure | GoTo | Touch | Place | Release
-STEPS = (Reach, Grasp, Actuate, Configure, GoTo, Touch, Place, Release)
+Step = Reach | Grasp | Actuate | GoTo | Touch | Place | Release | Configure
+STEPS = (Reach, Grasp, Actuate, GoTo, Touch, Place, Release, Configure)
 """All step classes."""
 _KINDS: dict[str, Any] = {kind.__name__: kind for kind in STEPS}
 

@@ -84,7 +84,11 @@ def check_complete(folder: Path) -> set[str]:
 
 @pytest.mark.parametrize(
     ("redirection", "words", "code"),
-    [(">PIPE", TIMED_OUT, 1), ("2>FULL", TIMED_OUT, 1), (">&- 2>&- <&-", INFEASIBLE, 3)],
+    [
+        pytest.param(">PIPE", TIMED_OUT, 1, marks=pytest.mark.long),
+        ("2>FULL", TIMED_OUT, 1),
+        (">&- 2>&- <&-", INFEASIBLE, 3),
+    ],
 )
 def test_files_are_written_when_outputs_are_closed(
     redirection: str, words: str, code: int, tmp_path: Path, shell: Shell
@@ -200,7 +204,7 @@ def test_ctrl_c_while_planning_writes_the_best_motion(tmp_path: Path) -> None:
         assert vkc.Plan.load(tmp_path / "plan.npz").status in ("interrupted", "success")
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.2])
+@pytest.mark.parametrize("delay", [pytest.param(0.0, marks=pytest.mark.long), 0.2])
 def test_ctrl_c_while_writing_leaves_complete_files(delay: float, tmp_path: Path) -> None:
     outputs = f"{OUTPUTS} --html plan.html --plots plots --quiet"
     process = start_process(f"{SUCCESS} {outputs}", tmp_path)

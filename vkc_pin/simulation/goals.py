@@ -116,7 +116,7 @@ def measure_goal_errors(
         row = find_row(edge)
         for subject, amount, unit in goals.compute_errors(step, completed, edge, rows[row]):
             errors.append(Miss(number + 1, subject, amount, unit, float(times[row])))
-        for name, support in goals.find_supported(before, completed).items():
+        for name, support in goals.list_supported_objects(before, completed).items():
             edge = goals.find_rest(name, completed)
             row = find_row(edge)
             found = goals.compute_support_errors(name, support, edge, rows[row])
@@ -170,7 +170,7 @@ class _Goals:
         else:
             yield from _compute_goal_errors(self.world, self.planned.scene, step, row)
 
-    def find_supported(self, before: int, completed: int) -> Mapping[str, str]:
+    def list_supported_objects(self, before: int, completed: int) -> Mapping[str, str]:
         """Return the free objects that others carry along between two edges, and on which link."""
         found: dict[str, str] = {}
         for supports in self.supports[before:completed]:

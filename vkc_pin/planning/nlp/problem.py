@@ -240,7 +240,7 @@ class TrajectoryProblem:
         for name, (lower, upper) in phase.configuration.items():
             column = self.chain.index(name)
             turns = 0.0
-            if self.unit(name) == "rad" and np.isinf(self.chain.upper[column]):
+            if self.chain.robot.is_periodic(column):
                 away = (lower + upper) / 2 - self.start[column]
                 turns = wrap_angle(away) - away
             goals[name] = lower + turns, upper + turns

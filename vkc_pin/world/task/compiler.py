@@ -22,7 +22,7 @@ from vkc_pin.world.task.actuation import (
     find_shared_coordinate,
     list_driving_attachments,
 )
-from vkc_pin.world.task.configurations import check_pose_is_meant, find_configuration
+from vkc_pin.world.task.configurations import check_pose_is_unambiguous, find_configuration
 from vkc_pin.world.task.lookup import (
     check_link,
     compute_openings,
@@ -450,7 +450,7 @@ class _Compiler:
         elif isinstance(step, Grasp):
             self.grasp(step.object, step.attachment, where, step.by)
         elif isinstance(step, Reach):
-            check_pose_is_meant(self.scene, step, f"{where}.pose")
+            check_pose_is_unambiguous(self.scene, step, f"{where}.pose")
             frame = find_robot_frame(self.scene, step.frame, f"{where}.frame")
             self._release_fixed_objects()
             goals = (FrameGoal(frame, step.pose),)

@@ -13,7 +13,7 @@ from vkc_pin.world.models.shapes import LIMIT_SLACK
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Configure, Reach
 
-__all__ = ["check_pose_is_meant", "find_configuration"]
+__all__ = ["check_pose_is_unambiguous", "find_configuration"]
 
 _ROUNDING = 1e-4
 """Excess of a goal over a limit that is cut off [rad] or [m].
@@ -53,7 +53,7 @@ def find_configuration(scene: Scene, step: Configure, where: str) -> dict[str, _
     return found
 
 
-def check_pose_is_meant(scene: Scene, step: Reach, where: str) -> None:
+def check_pose_is_unambiguous(scene: Scene, step: Reach, where: str) -> None:
     """Check that a list of numbers for a pose cannot be read as values of the arm's joints.
 
     Raises:

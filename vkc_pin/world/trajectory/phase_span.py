@@ -10,7 +10,7 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.utils.arguments import check_integer, check_mapping, check_number, check_text
 from vkc_pin.world.scene.hold import Hold, check_hold_order, make_holds
 
-__all__ = ["PhaseSpan", "check_fields", "get_required"]
+__all__ = ["PhaseSpan", "check_fields", "get_required_field"]
 
 _FIELDS = ("name", "first", "last", "held", "by", "deviation", "opening")
 
@@ -80,9 +80,13 @@ class PhaseSpan:
         """
         phase = check_fields(check_mapping(data, where), _FIELDS, where)
         held = make_holds(
-            get_required(phase, "held", where), phase.get("by"), deviation=phase.get("deviation")
+            get_required_field(phase, "held", where),
+            phase.get("by"),
+            deviation=phase.get("deviation"),
         )
-        name, first, last = (get_required(phase, key, where) for key in ("name", "first", "last"))
+        name, first, last = (
+            get_required_field(phase, key, where) for key in ("name", "first", "last")
+        )
         return cls(name, first, last, held, phase.get("opening"))
 
 
@@ -94,7 +98,7 @@ def check_fields(data: Mapping[str, Any], known: Collection[str], where: str) ->
     return data
 
 
-def get_required(data: Mapping[str, Any], name: str, where: str = "") -> Any:
+def get_required_field(data: Mapping[str, Any], name: str, where: str = "") -> Any:
     """Return an entry of a motion's data. Raises `InputError` if it is missing."""
     if name not in data:
         field = ".".join(part for part in (where, name) if part)

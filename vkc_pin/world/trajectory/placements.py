@@ -119,7 +119,8 @@ def sample_motion(
         world: The scene as one tree.
         trajectory: The motion.
         times: Shape (K,) [s]. Default: those of key frames.
-        step: Largest step between key frames [rad], [m]. Default: what a viewer needs.
+        step: Largest step between key frames [rad], [m]. Default: the largest with which
+            viewers follow the motion.
     """
     if trajectory is None:
         times, rows = np.zeros(1), world.start[None]

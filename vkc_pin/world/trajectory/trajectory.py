@@ -25,7 +25,7 @@ from vkc_pin.utils.arguments import (
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.trajectory.curve import Curve, sample_evenly
 from vkc_pin.world.trajectory.formats import ros, rosbag, tables
-from vkc_pin.world.trajectory.phase_span import PhaseSpan, check_fields, get_required
+from vkc_pin.world.trajectory.phase_span import PhaseSpan, check_fields, get_required_field
 
 __all__ = ["Trajectory"]
 
@@ -282,17 +282,17 @@ class Trajectory:
             raise InputError("not a trajectory", expected="an object", got=type(data).__name__)
         check_fields(data, _FIELDS, "")
         listed: tuple[Any, ...] = check_list(
-            get_required(data, "phases"), "phases", "a list of phases"
+            get_required_field(data, "phases"), "phases", "a list of phases"
         )
         phases = [PhaseSpan.from_dict(item, f"phases[{k}]") for k, item in enumerate(listed)]
         names, times, positions, size = (
-            get_required(data, key) for key in ("names", "times", "positions", "robot_size")
+            get_required_field(data, key) for key in ("names", "times", "positions", "robot_size")
         )
         curve = data.get("curve")
         if curve is not None:
             parts = ("times", "positions", "rates")
             knots = check_fields(check_mapping(curve, "curve"), parts, "curve")
-            curve = Curve(*(get_required(knots, key, "curve") for key in parts))
+            curve = Curve(*(get_required_field(knots, key, "curve") for key in parts))
         return cls(names, times, positions, tuple(phases), size, curve)
 
     def to_csv(self, path: str | Path, **options: Any) -> Path:

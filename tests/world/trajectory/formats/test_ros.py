@@ -437,7 +437,7 @@ def test_names_that_do_not_fit_are_rejected(plan: vkc.Plan) -> None:
 def test_messages_with_other_times_than_phases_are_rejected(
     door_plan: vkc.Plan, tmp_path: Path, kind: str
 ) -> None:
-    """Grasps would else begin somewhere on the way."""
+    """Otherwise grasps would begin between the phases of the motion."""
     motion = door_plan.trajectory
     message = motion.to_ros(joints="all")
     times = read_times(message)

@@ -149,19 +149,18 @@ def test_planes_of_the_worst_contacts_are_kept() -> None:
 
 
 def test_evaluations_count_towards_the_budget() -> None:
-    """The search for the first collision stops at that waypoint."""
+    """The check of a run stops at its first collision."""
     problem = make_door_problem()
     z = np.tile(problem.start, (5, 1))
     inside = z.copy()
     inside[2:, :2] = load_door_scene().objects["door"].placement.translation[:2]
-    for evaluate, expected in (
-        (lambda: problem.contacts.evaluate(z, np.ones(5, int), reach=0.1), 5),
-        (lambda: problem.contacts.find_first_collision(z, 1, reach=0.0, allowed=1.0), 5),
-        (lambda: problem.contacts.find_first_collision(inside, 1, reach=0.1, allowed=0.01), 3),
-    ):
-        with Budget().activate() as budget:
-            found = evaluate()
-        assert budget.evaluations == expected
-    assert found == 2
+    with Budget().activate() as budget:
+        problem.contacts.evaluate(z, np.ones(5, int), reach=0.1)
+    assert budget.evaluations == 5
+    rows, edges = np.concatenate([z, inside, inside[2:]]), np.array([0, 5, 10, 10, 13])
+    with Budget().activate() as budget:
+        free = problem.contacts.count_free(rows, edges, 1, reach=0.1, allowed=0.01)
+    assert free.tolist() == [5, 2, 0, 0]
+    assert budget.evaluations == 5 + 3 + 0 + 1
     with Budget(seconds=0.0).activate(), pytest.raises(BudgetExhaustedError):
         build_phase_geometries(load_door_scene(), problem.chain, problem.task, SHORT)

@@ -294,7 +294,7 @@ def test_auto_postpones_guesses_in_collision_and_checks_feasibility_before_rrt(
         return is_infeasible
 
     found = list(initialize(make_gate_problem(NARROW), "auto", 0, count=2, is_infeasible=answer))
-    names = ["interpolated"] if is_infeasible else ["rrt", "interpolated"]
+    names = ["interpolated"] if is_infeasible else ["rrt", "rrt 2", "interpolated"]
     assert [guess.name for guess in found[: len(names)]] == names
     assert found[len(names) - 1].penetration > MAX_GOOD_PENETRATION
     assert all("rrt" not in guess.name for guess in found) == is_infeasible

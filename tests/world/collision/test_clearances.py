@@ -166,11 +166,14 @@ def test_first_violation_matches_an_exhaustive_search(
         any(margin - distance > allowed for _, distance, _, margin in rows[state])
         for state in order
     ]
-    expected = hit.index(True) if True in hit else STATES
+    cuts = np.sort(room.rng.integers(STATES + 1, size=3))
+    edges = np.array([0, *cuts, STATES])
+    runs = [hit[first:end] for first, end in itertools.pairwise(edges)]
+    expected = [run.index(True) if True in run else len(run) for run in runs]
     clearances, limits = room.make_clearances(), {"reach": reach, "allowed": allowed}
-    for states, first in ((order, expected), (order[:0], 0)):
-        q, z = room.q[states], room.z[states]
-        assert clearances.find_first_violation(q, z, waypoint, **limits) == first
+    q, z = room.q[order], room.z[order]
+    assert clearances.count_free(q, z, edges, waypoint, **limits).tolist() == expected
+    assert clearances.count_free(q[:0], z[:0], np.zeros(1, int), waypoint, **limits).size == 0
 
 
 def test_fixed_shapes_can_be_moved() -> None:

@@ -67,9 +67,9 @@ def plan_by_sampling(  # noqa: C901, PLR0915 - sets up one planner, step by step
     space.setBounds(bounds)
 
     def blocked(z: Floats) -> int:
-        return problem.contacts.find_first_collision(
-            z, middle, reach=problem.options.largest_margin, allowed=0.0
-        )
+        whole = np.array([0, len(z)])
+        reach = problem.options.largest_margin
+        return int(problem.contacts.count_free(z, whole, middle, reach=reach, allowed=0.0)[0])
 
     def values(state: Any) -> Floats:
         return np.array([state[k] for k in range(size)]) / scale

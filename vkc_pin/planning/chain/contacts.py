@@ -214,23 +214,25 @@ class ContactModel:
         columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
         return Contacts(*columns).select(np.argsort(columns[0], kind="stable"))
 
-    def find_first_collision(
-        self, z: Floats, waypoint: int, *, reach: float, allowed: float
-    ) -> int:
-        """Return the first configuration with a shortfall of more than `allowed` [m]; W if none.
+    def count_free(
+        self, z: Floats, edges: Ints, waypoint: int, *, reach: float, allowed: float
+    ) -> Ints:
+        """Return how many configurations of each run precede the first collision, shape (R,).
+
+        Each run is evaluated up to its first collision only.
 
         Args:
             z: Configurations, shape (W, n).
+            edges: Index of the first configuration of each run, and the end of the last, (R + 1,).
             waypoint: Waypoint whose phase all of them belong to.
             reach: Pairs further apart are ignored [m].
             allowed: Allowed margin shortfall [m].
         """
         clearances = self._clearances[self.find_phase(waypoint)]
-        found = clearances.find_first_violation(
-            self.chain.coordinates.q(z), z, waypoint, reach=reach, allowed=allowed
-        )
-        record_evaluations(min(found + 1, len(z)))
-        return found
+        q = self.chain.coordinates.q(z)
+        free = clearances.count_free(q, z, edges, waypoint, reach=reach, allowed=allowed)
+        record_evaluations(int(np.minimum(free + 1, np.diff(edges)).sum()))
+        return free
 
     def compute_placements(self, z: Floats) -> tuple[Floats, Floats]:
         """Return the chain's `joint_placements`, evaluated in batches of one size.

@@ -9,15 +9,18 @@ import numpy as np
 from vkc_pin.planning.base_paths.arcs import Curves, interpolate_arcs, sample_path
 from vkc_pin.planning.initialization.approach_paths import ApproachPaths
 from vkc_pin.planning.initialization.base_routes import BaseRoutes
-from vkc_pin.planning.initialization.keyframes import KeyframeSampler, sample_smoothstep
-from vkc_pin.planning.initialization.rrt import (
+from vkc_pin.planning.initialization.closed_trees import (
     MAX_EXTENSIONS,
     find_closed_path,
-    find_open_path,
     needs_trees,
 )
+from vkc_pin.planning.initialization.keyframes import KeyframeSampler, sample_smoothstep
+from vkc_pin.planning.initialization.open_trees import Guide, find_open_path
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.task.phases import Phase
+
+FIRST_CHECKS = 50_000
+"""Collision checks after which a search with trees pauses for the first time."""
 
 __all__ = ["AStarPaths", "CurvePaths", "Interpolator", "Paths", "RrtPaths", "make_base_paths"]
 
@@ -93,15 +96,28 @@ class RrtPaths:
         folded = self.routes.get_folded_arm(phase)
         nearest = self.routes.find_nearest_folded_arm(phase, start, goal)
         arms = np.array([start, goal, problem.chain.robot.home, folded, nearest])
-        ends = np.tile(last, (1 if reaches else len(arms), 1))
-        if not reaches:
-            ends[:, arm] = arms
-        limit = self._get_extension_limit(phase)
+        ends = last[None] if reaches else self._list_ends(phase, last, arms)
+        number = self._failures[phase]
         path = find_open_path(
-            self.sampler, phase, first, ends, steps, limit, poses=poses, arms=arms
+            self.sampler,
+            phase,
+            first,
+            ends,
+            steps,
+            FIRST_CHECKS * 2 ** (number // 2),
+            Guide(poses, arms),
+            allowed=0.0 if number % 2 else problem.options.dist_safe,
         )
         self._count_failures(phase, path)
         return None if path is None else path[:, : arm.stop]
+
+    def _list_ends(self, phase: int, last: Floats, arms: Floats) -> Floats:
+        """Return configurations like `last` with other postures, within the limits of the goal."""
+        end = int(self.problem.ends[phase]) - 1
+        ends = np.tile(last, (len(arms), 1))
+        ends[:, 3 : self.sampler.robot_size] = arms
+        ends = np.clip(ends, self.problem.lower[end], self.problem.upper[end])
+        return np.unique(ends, axis=0)
 
     def find_closed_path(self, phase: int, through: Floats, straight: Floats) -> Floats | None:
         """Find waypoints of a closed phase around obstacles; None if straight lines are free."""

@@ -193,9 +193,6 @@ def _generate_guesses(
 class _GuessSearch:
     """Generates guesses along the cheapest keyframe paths: straight, or with A* for the base."""
 
-    compared_columns: int | None = None
-    """Number of leading coordinates by which paths are compared; None: all."""
-
     def __init__(self, shared: _Shared, method: str) -> None:
         self.problem, self.notes, self.method = shared.problem, shared.notes, method
         self.beam, self.interpolator = self._make_parts(shared)
@@ -237,6 +234,10 @@ class _GuessSearch:
             found = min(found, other, key=lambda one: float(one.cost.min()))
         return found
 
+    def _is_same(self, path: Floats, other: Floats) -> bool:
+        """Return whether two paths lead to the same guess."""
+        return bool(np.abs(path - other).max() <= SIMILARITY_TOLERANCE)
+
     def _order_paths(self, found: SearchResult) -> Iterable[Floats]:
         """Return paths by cost."""
         return found.paths[np.argsort(found.cost, kind="stable")]
@@ -257,10 +258,7 @@ class _GuessSearch:
         for path in self._order_paths(found):
             if len(compared) == _COMPARED_PATHS:
                 break
-            if any(np.abs(path - other)[:, :3].max() <= options.dist_safe for other in used) or any(
-                np.abs(path - other)[:, : self.compared_columns].max() <= SIMILARITY_TOLERANCE
-                for other in compared
-            ):
+            if any(self._is_same(path, other) for other in [*used, *compared]):
                 continue
             compared.append(path)
             z = self.interpolator.interpolate(path, found.waypoints)
@@ -285,8 +283,6 @@ class _RrtSearch(_GuessSearch):
     Trees are slow, so the first guess that is nearly free is taken.
     """
 
-    compared_columns = 3  # if trees fail along a base path, another arm rarely helps
-
     def _make_parts(self, shared: _Shared) -> tuple[BeamSearch, Interpolator]:
         # Directions (backwards or not) in which the last search failed.
         self.failed_directions = set[bool]()
@@ -307,6 +303,9 @@ class _RrtSearch(_GuessSearch):
             return found
         self.failed_directions.add(backwards)
         return None
+
+    def _is_same(self, path: Floats, other: Floats) -> bool:
+        return False  # trees lead another way each time
 
     def _is_sufficient(self, z: Floats, shortfall: float, penetration: float) -> bool:
         return penetration <= MAX_GOOD_PENETRATION

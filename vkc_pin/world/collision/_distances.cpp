@@ -61,5 +61,5 @@ NB_MODULE(_distances, module)
     .def(nb::init<const Numbers<3> &, const Numbers<3> &, const Numbers<2> &, const Numbers<2> &>())
     .def("near", &WorldBoxes::near);
   module.def("nearest", &nearest);
-  module.def("first_blocked", &first_blocked);
+  module.def("count_free", &count_free);
 }

@@ -197,15 +197,16 @@ std::tuple<Array<Index>, Array<Index>, Array<double>, Array<double>, Array<doubl
           handed_over(std::move(second), {count, 3})};
 }
 
-// First configuration in which a pair closer than `reach` violates its margin by more than
-// `allowed`; W if there is none.
-Index first_blocked(
+// For each run of configurations, from one of `edges` to the next, the number of those before the
+// first one in which a pair closer than `reach` violates its margin by more than `allowed`.
+Array<Index> count_free(
   const Bodies & bodies,
   const Boxes & boxes,
   const Shapes & shapes,
   const Margins & margins,
   const Numbers<2> & q,
   const Numbers<2> & z,
+  const Indices<1> & edges,
   Index waypoint,
   double reach,
   double allowed,
@@ -213,12 +214,23 @@ Index first_blocked(
 {
   const Parts parts{bodies, boxes, shapes, margins};
   const States states(parts, q, z);
-  nb::gil_scoped_release released;
-  Clearing clearing(parts, states, reach, rounding);
-  std::size_t state = 0;
-  while (state < states.count && !clearing.blocked(state, waypoint, allowed))
-    ++state;
-  return Index(state);
+  const Index * edge = edges.data();
+  if (!edges.shape(0) || edge[0] < 0 || edge[edges.shape(0) - 1] > Index(states.count))
+    throw std::out_of_range("runs are within the configurations");
+  std::vector<Index> free(edges.shape(0) - 1);
+  {
+    nb::gil_scoped_release released;
+    Clearing clearing(parts, states, reach, rounding);
+    for (std::size_t run = 0; run < free.size(); ++run)
+    {
+      Index state = edge[run];
+      while (state < edge[run + 1] && !clearing.blocked(std::size_t(state), waypoint, allowed))
+        ++state;
+      free[run] = state - edge[run];
+    }
+  }
+  const std::size_t count = free.size();
+  return handed_over(std::move(free), {count});
 }
 
 } // namespace

@@ -272,10 +272,8 @@ class Clearances:
     ) -> None:
         self.placements, self.boxes, self.shapes, self.margins = placements, boxes, shapes, margins
         self._parts = placements.compiled, boxes.compiled, shapes.compiled, margins.compiled
-        self._find_closest_pairs, self._find_first_violation = (
-            load_compiled().nearest,
-            load_compiled().first_blocked,
-        )
+        self._find_closest_pairs = load_compiled().nearest
+        self._count_free = load_compiled().count_free
 
     def move_fixed(self, boxes: Boxes, where: Mapping[int, pin.SE3]) -> Clearances:
         """Return a copy with some fixed shapes at other placements.
@@ -315,18 +313,21 @@ class Clearances:
             )
         )
 
-    def find_first_violation(
-        self, q: Floats, z: Floats, waypoint: int, *, reach: float, allowed: float
-    ) -> int:
-        """Return the first configuration that violates a margin by more than `allowed` [m], or W.
+    def count_free(
+        self, q: Floats, z: Floats, edges: Ints, waypoint: int, *, reach: float, allowed: float
+    ) -> Ints:
+        """Return how many configurations of each run precede the first violation, shape (R,).
+
+        A configuration violates if a pair lacks more than `allowed` [m] of its margin.
 
         Args:
             q: Pinocchio configurations, shape (W, nq).
             z: Minimal coordinates, shape (W, n).
+            edges: Index of the first configuration of each run, and the end of the last, (R + 1,).
             waypoint: Index of the waypoint, which selects the margins.
             reach: Pairs further apart are ignored [m].
             allowed: Tolerated violation [m].
         """
-        return int(
-            self._find_first_violation(*self._parts, q, z, waypoint, reach, allowed, _ROUNDING)
+        return np.asarray(
+            self._count_free(*self._parts, q, z, edges, waypoint, reach, allowed, _ROUNDING)
         )

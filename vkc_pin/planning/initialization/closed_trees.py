@@ -1,16 +1,13 @@
-"""Finds paths of base and arm around obstacles with two random trees.
+"""Finds paths of base and arm around obstacles in closed phases with two random trees.
 
-RRT-Connect (Kuffner and LaValle, ICRA 2000) in all coordinates. In phases with a closed chain,
-steps are projected to the closure manifold (Berenson, Srinivasa, Ferguson and Kuffner,
-*Manipulation planning on constraint manifolds*, ICRA 2009), and the progress of the object joints
-along their given motion is one more coordinate: a door may wait until the arm is out of its frame.
-In open phases, samples are near a guide path of the base, with arm postures that are likely to be
-needed there, so that narrow passages are found quickly. Why not OMPL: docs/decisions/0012.
+RRT-Connect (Kuffner and LaValle, ICRA 2000) in all coordinates. Steps are projected to the closure
+manifold (Berenson, Srinivasa, Ferguson and Kuffner, *Manipulation planning on constraint
+manifolds*, ICRA 2009), and the progress of the object joints along their given motion is one more
+coordinate: a door may wait until the arm is out of its frame.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from typing import NamedTuple
 
 import numpy as np
@@ -26,19 +23,14 @@ from vkc_pin.utils.arrays import Bools, Floats, Ints
 __all__ = [
     "MAX_EXTENSIONS",
     "find_closed_path",
-    "find_open_path",
     "needs_trees",
 ]
 
 MAX_EXTENSIONS = 3000
 """Maximum number of tree extensions."""
 _STEP = 0.15  # between collision checks, in the metric of searches: [rad] of a joint
-_GUIDED_SAMPLES = SAMPLE_COUNT // 8  # towards which a tree grows at once in an open phase
-_CLOSED_SAMPLES = SAMPLE_COUNT // 4
-# largest standard deviation of samples in open phases from guide path and likely postures
-_BASE_SPREAD, _ARM_SPREAD = 0.1, 0.4  # [m] and [rad]
-_STRAIGHTENING_ROUNDS = 3
-_MIN_SAVING = 1e-3  # relative saving in length that a partial shortcut needs
+_SAMPLES = SAMPLE_COUNT // 4
+_MIN_SAVING = 1e-3  # relative saving in length that a shortcut needs
 
 
 def needs_trees(sampler: KeyframeSampler, phase: int, through: Floats, straight: Floats) -> bool:
@@ -82,37 +74,6 @@ def find_closed_path(
     return None if path is None else search.resample(search.shorten(path), steps)
 
 
-def find_open_path(
-    sampler: KeyframeSampler,
-    phase: int,
-    first: Floats,
-    ends: Floats,
-    steps: int,
-    max_extensions: int,
-    *,
-    poses: Floats,
-    arms: Floats,
-) -> Floats | None:
-    """Find waypoints of the robot in an open phase.
-
-    Args:
-        sampler: Keyframe sampler of the problem.
-        phase: Number of the phase.
-        first: Start configuration, shape (n,); coordinates outside the robot stay constant.
-        ends: Possible end configurations, shape (E, n).
-        steps: Number of waypoints.
-        max_extensions: Maximum number of tree extensions.
-        poses: x, y [m] and yaw [rad] along a guide path of the base, shape (P, 3).
-        arms: Arm postures that are likely to be needed, shape (A, m - 3) [m] or [rad].
-
-    Returns:
-        Nearly collision-free waypoints, shape (steps, n); None if no path was found.
-    """
-    search = _OpenSearch(sampler, phase, first, poses, arms)
-    path = search.connect(first[None], ends, max_extensions)
-    return None if path is None else search.resample(search.straighten(search.shorten(path)), steps)
-
-
 class _Path(NamedTuple):
     """Configurations, shape (P, n), and their progress as fractional waypoints, shape (P,)."""
 
@@ -136,24 +97,49 @@ class _Tree:
         return _Path(self.z[nodes], self.at[nodes])
 
 
-class _Search(ABC):
-    """Searches a path in one phase, from progress `begin` to `end`."""
+class _ClosedSearch:
+    """Searches a closed phase, with the grasp of its first configuration."""
 
-    def __init__(self, sampler: KeyframeSampler, phase: int, begin: float) -> None:
+    def __init__(self, sampler: KeyframeSampler, phase: int, through: Floats, steps: int) -> None:
         self.sampler, self.problem = sampler, sampler.problem
-        self.begin, self.end = begin, float(self.problem.ends[phase])
+        end = int(self.problem.ends[phase])
+        self.begin, self.end = float(end - steps), float(end)
         self.waypoint = self.problem.contacts.find_waypoint(phase)
+        pose = sampler.find_pose(end)
+        assert pose is not None, "a grasped articulated object closes the chain"
+        self.pose, self.through = pose, through
+        motion = np.vstack([self.problem.start, sampler.object_motion])
+        self.object_motion = motion[end - steps : end + 1, sampler.object_columns]
+        self.grasp_columns = sampler.find_grasp_columns(end)
 
-    @abstractmethod
     def project(self, z: Floats, at: Floats) -> tuple[Floats, Bools]:
         """Project configurations, shape (B, n), with their progress to the constraints.
 
         Returns projected configurations, and a mask of those that satisfy the constraints.
         """
+        z, columns = z.copy(), self.sampler.object_columns
+        whole = np.arange(self.begin, self.end + 1)
+        z[:, columns] = np.stack(
+            [np.interp(at, whole, column) for column in self.object_motion.T], axis=1
+        )
+        lower, upper = self.sampler.compute_limits(z, self.waypoint)
+        lower[:, columns] = upper[:, columns] = z[:, columns]
+        return self.sampler.solve_pose(z, self.pose, lower, upper)
 
-    @abstractmethod
     def sample(self) -> tuple[Floats, float]:
         """Sample nearly collision-free configurations, shape (B, n), and their progress."""
+        waypoint = int(self.sampler.rng.integers(int(self.begin) + 1, int(self.end) + 1))
+        return self.sample_waypoint(waypoint), float(waypoint)
+
+    def sample_waypoint(self, waypoint: int) -> Floats:
+        """Sample nearly collision-free configurations at a waypoint with the phase's grasp."""
+        before, found = self.through[np.arange(_SAMPLES) % len(self.through)], []
+        for how in ("scatter", "shake"):
+            z, closed = self.sampler.sample(before, waypoint, how)
+            is_same = z[:, self.grasp_columns] == self.through[0, self.grasp_columns]
+            found.append(z[closed & is_same.all(axis=1)])
+        z = np.concatenate(found)
+        return z[self.are_free(z)] if len(z) else z
 
     def are_free(self, z: Floats) -> Bools:
         """Return which configurations are nearly collision-free, shape (B,).
@@ -240,28 +226,6 @@ class _Search(ABC):
             path = self.replace(path, first, last, z, at)
         return path
 
-    def straighten(self, path: _Path) -> _Path:
-        """Move the arm, and each joint alone, evenly along a path where that is collision-free.
-
-        A path through a narrow passage with another posture moves all joints. Straight lines in all
-        coordinates seldom undo that, and the solver cannot, because obstacles are in between. So
-        coordinates are treated separately (partial shortcuts: Geraerts and Overmars, IJRR 2007),
-        first along the whole path, then between random points on it.
-        """
-        arm = range(3, self.sampler.robot_size)
-        for number in range(1 + _STRAIGHTENING_ROUNDS):
-            for columns in [list(arm), *([column] for column in arm)]:
-                first, last = 0, len(path.z) - 1
-                if number:
-                    first, last = sorted(self.sampler.rng.integers(len(path.z), size=2))
-                if last - first > 1:
-                    part = path.z[first : last + 1]
-                    passed = np.cumsum(self.compute_gaps(part))
-                    share, z = (passed[:-1] / max(passed[-1], 1e-12))[:, None], part[1:-1].copy()
-                    z[:, columns] = part[0, columns] + share * (part[-1] - part[0])[columns]
-                    path = self.replace(path, first, last, z, path.at[first + 1 : last])
-        return path
-
     def replace(self, path: _Path, first: int, last: int, z: Floats, at: Floats) -> _Path:
         """Replace the piece between two points of a path by a shorter, collision-free one."""
         z, feasible = self.project(z, at)
@@ -282,71 +246,3 @@ class _Search(ABC):
         z = np.stack([np.interp(rows, passed, column) for column in path.z.T], axis=1)
         z, feasible = self.project(z, np.interp(rows, passed, path.at))
         return z if feasible.all() else None
-
-
-class _ClosedSearch(_Search):
-    """Searches in a phase with a closed chain, with the grasp of its first configuration."""
-
-    def __init__(self, sampler: KeyframeSampler, phase: int, through: Floats, steps: int) -> None:
-        end = int(sampler.problem.ends[phase])
-        super().__init__(sampler, phase, float(end - steps))
-        pose = sampler.find_pose(end)
-        assert pose is not None, "a grasped articulated object closes the chain"
-        self.pose, self.through = pose, through
-        motion = np.vstack([self.problem.start, sampler.object_motion])
-        self.object_motion = motion[end - steps : end + 1, sampler.object_columns]
-        self.grasp_columns = sampler.find_grasp_columns(end)
-
-    def project(self, z: Floats, at: Floats) -> tuple[Floats, Bools]:
-        z, columns = z.copy(), self.sampler.object_columns
-        whole = np.arange(self.begin, self.end + 1)
-        z[:, columns] = np.stack(
-            [np.interp(at, whole, column) for column in self.object_motion.T], axis=1
-        )
-        lower, upper = self.sampler.compute_limits(z, self.waypoint)
-        lower[:, columns] = upper[:, columns] = z[:, columns]
-        return self.sampler.solve_pose(z, self.pose, lower, upper)
-
-    def sample(self) -> tuple[Floats, float]:
-        waypoint = int(self.sampler.rng.integers(int(self.begin) + 1, int(self.end) + 1))
-        return self.sample_waypoint(waypoint), float(waypoint)
-
-    def sample_waypoint(self, waypoint: int) -> Floats:
-        """Sample nearly collision-free configurations at a waypoint with the phase's grasp."""
-        before, found = self.through[np.arange(_CLOSED_SAMPLES) % len(self.through)], []
-        for how in ("scatter", "shake"):
-            z, closed = self.sampler.sample(before, waypoint, how)
-            is_same = z[:, self.grasp_columns] == self.through[0, self.grasp_columns]
-            found.append(z[closed & is_same.all(axis=1)])
-        z = np.concatenate(found)
-        return z[self.are_free(z)] if len(z) else z
-
-
-class _OpenSearch(_Search):
-    """Searches in an open phase, near a guide path of the base."""
-
-    def __init__(
-        self, sampler: KeyframeSampler, phase: int, first: Floats, poses: Floats, arms: Floats
-    ) -> None:
-        super().__init__(sampler, phase, float(sampler.problem.ends[phase]))
-        self.first, self.poses, self.arms = first, poses, arms
-        names = self.problem.chain.names[: sampler.robot_size]
-        self.lower, self.upper = np.array([self.problem.limits(name) for name in names]).T
-
-    def project(self, z: Floats, at: Floats) -> tuple[Floats, Bools]:
-        robot, others = np.split(z, [len(self.lower)], axis=1)
-        z = np.hstack([np.clip(robot, self.lower, self.upper), others])
-        return z, np.ones(len(z), bool)
-
-    def sample(self) -> tuple[Floats, float]:
-        rng, count = self.sampler.rng, _GUIDED_SAMPLES
-        arm = slice(3, self.sampler.robot_size)
-        z = np.tile(self.first, (count, 1))
-        z[:, :3] = rng.choice(self.poses, count)
-        z[:, arm] = rng.choice(self.arms, count)
-        # Half of them are exactly on the guide path, in one of the likely postures.
-        spread = rng.uniform(0.0, 1.0, (count, 1)) * rng.integers(2, size=(count, 1))
-        z[:, :3] += _BASE_SPREAD * spread * rng.normal(size=(count, 3))
-        z[:, arm] += _ARM_SPREAD * spread * rng.normal(size=z[:, arm].shape)
-        z, _ = self.project(z, np.full(count, self.end))
-        return z[self.are_free(z)], self.end

@@ -1,0 +1,374 @@
+"""Finds paths of base and arm around obstacles in open phases with two random trees.
+
+RRT-Connect (Kuffner and LaValle, ICRA 2000) in all coordinates of the robot. Half of the samples
+are near a guide path of the base, with arm postures that are likely to be needed there, so that
+narrow passages are found quickly; the others are uniform, so that every path is found in the end.
+Three choices decide how soon an arm finds its way out of a shelf or a cage:
+
+- A tree grows by whole pieces of at most `_PIECE`, never by a part of one that ends at an obstacle.
+  Otherwise the pocket around a narrow goal fills with nodes at its walls.
+- The smaller tree grows, since the one in the narrower place grows more slowly.
+- Many samples are tried at once: most pieces are blocked, and the checks of a batch are one
+  compiled call.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+
+from vkc_pin.planning.initialization.keyframes import (
+    KeyframeSampler,
+    compute_shortfall,
+    sample_smoothstep,
+)
+from vkc_pin.utils.arrays import Bools, Floats, Ints
+
+__all__ = ["Guide", "find_open_path"]
+
+_PIECE = 1.0  # longest edge of a tree, in the metric of searches: [rad] of a joint
+_CHECK_STEP, _FINE_STEP = 0.05, 0.01  # between collision checks while trees grow, and of the result
+_SAMPLES = 32  # towards which a tree grows at once
+# largest standard deviation of guided samples from guide path and likely postures
+_BASE_SPREAD, _ARM_SPREAD = 0.1, 0.4  # [m] and [rad]
+_SHORTCUTS = 100  # tried on a path; each is a line between two random points
+_STRAIGHTENING_ROUNDS = 3
+_PRODUCT_SIZE = 200_000  # multiplications in a product of matrices that needs no threads
+_FAR = 1e6  # scaled coordinates of nodes that are cut off
+_MIN_DETOUR = 1e-6  # [rad] by which a corner is further from its neighbours than on a line
+_MIN_SAVING = 1e-3  # relative saving in length that a shortcut needs
+
+
+class Guide(NamedTuple):
+    """Where samples are likely to be needed.
+
+    Attributes:
+        poses: x, y [m] and yaw [rad] along a path of the base, shape (P, 3).
+        arms: Postures of the arm, shape (A, m - 3) [m] or [rad].
+    """
+
+    poses: Floats
+    arms: Floats
+
+
+def find_open_path(
+    sampler: KeyframeSampler,
+    phase: int,
+    first: Floats,
+    ends: Floats,
+    steps: int,
+    max_checks: int,
+    guide: Guide,
+    *,
+    allowed: float,
+) -> Floats | None:
+    """Find waypoints of the robot in an open phase.
+
+    Args:
+        sampler: Keyframe sampler of the problem.
+        phase: Number of the phase.
+        first: Start configuration, shape (n,); coordinates outside the robot stay constant.
+        ends: Possible end configurations, shape (E, n). If all of them lack more than `allowed`,
+            the least violating one is used unless it is deep in collision.
+        steps: Number of waypoints.
+        max_checks: Number of collision checks after which the search ends.
+        guide: Where samples are likely to be needed.
+        allowed: Clearance that configurations may lack [m].
+
+    Returns:
+        Waypoints, shape (steps, n), those at corners included where there are fewer corners than
+        waypoints; None if no path was found.
+    """
+    search = _TreeSearch(sampler, phase, first, ends, guide, allowed)
+    path = search.connect(max_checks)
+    return None if path is None else search.resample(search.shorten(path), steps)
+
+
+class _Tree:
+    """Configurations, shape (T, m), and the number of the parent of each; -1: a root.
+
+    Distances between configurations are Euclidean in scaled coordinates `weights * z`.
+    """
+
+    def __init__(self, roots: Floats, weights: Floats) -> None:
+        self.z, self.parents = roots, np.full(len(roots), -1)
+        self.weights = weights
+        self.scaled = weights * roots
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+    def add_branch(self, parent: int, z: Floats) -> int:
+        """Add configurations one after the other to a node; return the number of the last."""
+        numbers = np.arange(len(self.z), len(self.z) + len(z))
+        self.z = np.concatenate([self.z, z])
+        self.scaled = np.concatenate([self.scaled, self.weights * z])
+        self.parents = np.concatenate([self.parents, [parent], numbers[:-1]])
+        return int(numbers[-1])
+
+    def list_ancestors(self, node: int) -> list[int]:
+        """Return the numbers of a node, its parent and so on, up to a root."""
+        nodes = [node]
+        while self.parents[nodes[-1]] >= 0:
+            nodes.append(int(self.parents[nodes[-1]]))
+        return nodes
+
+    def cut(self, node: int) -> None:
+        """Make a node and all its descendants unreachable."""
+        cut = np.zeros(len(self.z), bool)
+        cut[node] = True
+        for number in range(node + 1, len(self.z)):
+            cut[number] = self.parents[number] >= 0 and cut[self.parents[number]]
+        self.z[cut] = np.nan
+        self.scaled[cut] = _FAR
+
+    def find_nearest(self, goals: Floats) -> tuple[Ints, Floats]:
+        """Return the numbers of the nodes nearest to goals, and their distances, shape (B,)."""
+        scaled = self.weights * goals
+        # |a − b|² = |a|² − 2 a·b + |b|²; the last part is the same for all nodes. BLAS computes
+        # large products in threads, which cost more than they save here.
+        squares = np.einsum("ij,ij->i", self.scaled, self.scaled)
+        parts = np.array_split(scaled, 1 + scaled.size * len(self.z) // _PRODUCT_SIZE)
+        nearest = np.concatenate(
+            [(squares - 2.0 * part @ self.scaled.T).argmin(axis=1) for part in parts]
+        )
+        return nearest, np.linalg.norm(self.scaled[nearest] - scaled, axis=1)
+
+
+class _TreeSearch:
+    """Searches a path of the robot's coordinates in one phase."""
+
+    def __init__(
+        self,
+        sampler: KeyframeSampler,
+        phase: int,
+        first: Floats,
+        ends: Floats,
+        guide: Guide,
+        allowed: float,
+    ) -> None:
+        self.problem, self.rng, self.guide = sampler.problem, sampler.rng, guide
+        self.waypoint = self.problem.contacts.find_waypoint(phase)
+        self.first, self.size = first, sampler.robot_size
+        self.weights = sampler.weights[: self.size]
+        self.checks = 0
+        names = self.problem.chain.names[: self.size]
+        limits = np.array([self.problem.limits(name) for name in names])
+        self.lower, self.upper = limits.T
+        # Uniform samples turn a joint without limits by half a turn at most.
+        middle = (first + ends[0])[: self.size] / 2.0
+        turns = np.array([self.problem.unit(name) == "rad" for name in names])
+        is_endless = turns & (self.upper - self.lower > 2.0 * np.pi)
+        self.lowest = np.where(is_endless, np.maximum(self.lower, middle - np.pi), self.lower)
+        self.highest = np.where(is_endless, np.minimum(self.upper, middle + np.pi), self.upper)
+        self.start, self.ends = first[None, : self.size], ends[:, : self.size]
+        # A search cannot keep more clearance than its ends, but these may not be deep in collision.
+        starting, ending = self._compute_shortfall(self.start), self._compute_shortfall(self.ends)
+        needed = max(float(starting[0]), float(ending.min()))
+        self.allowed = max(allowed, min(needed, 2.0 * self.problem.options.dist_safe))
+        self.ends = self.ends[ending <= self.allowed]
+        self.has_ends = needed <= self.allowed
+
+    def _compute_shortfall(self, z: Floats) -> Floats:
+        return compute_shortfall(self.problem, self._complete(z), self.waypoint)
+
+    def connect(self, max_checks: int) -> Floats | None:
+        """Find a path from the start to one of the ends, shape (P, m); None if there is none."""
+        if not self.has_ends:
+            return None
+        trees = _Tree(self.start, self.weights), _Tree(self.ends, self.weights)
+        tips, grown = np.arange(len(self.ends)), 1
+        while True:
+            one, other = trees[grown], trees[1 - grown]
+            path = self._try_connect(one, other, tips)
+            if path is not None:
+                return path if grown == 0 else path[::-1]
+            if self.checks >= max_checks:
+                return None
+            grown = 0 if len(trees[0]) <= len(trees[1]) else 1
+            before = len(trees[grown])
+            tips = np.unique(self._grow(trees[grown], self.sample())[0])
+            tips = tips[tips >= before]
+
+    def sample(self) -> Floats:
+        """Sample configurations, shape (_SAMPLES, m): half of them near the guide."""
+        half = _SAMPLES // 2
+        z = self.rng.uniform(self.lowest, self.highest, (_SAMPLES, self.size))
+        near = z[:half]
+        near[:, :3] = self.rng.choice(self.guide.poses, half)
+        near[:, 3:] = self.rng.choice(self.guide.arms, half)
+        # Half of these are exactly on the guide path, in one of the likely postures.
+        spread = self.rng.uniform(0.0, 1.0, (half, 1)) * self.rng.integers(2, size=(half, 1))
+        deviation = np.repeat([_BASE_SPREAD, _ARM_SPREAD], [3, self.size - 3])
+        near += spread * deviation * self.rng.normal(size=near.shape)
+        # A quarter of all have any posture on the guide path.
+        quarter = _SAMPLES // 4
+        z[half : half + quarter, :3] = self.rng.choice(self.guide.poses, quarter)
+        return np.clip(z, self.lower, self.upper)
+
+    def _grow(self, tree: _Tree, goals: Floats) -> tuple[Ints, Bools]:
+        """Grow a tree straight towards goals, shape (B, m), by whole pieces while they are free.
+
+        Returns:
+            The number of the last node towards each goal, and whether it is there, shape (B,).
+        """
+        nearest, gaps = tree.find_nearest(goals)
+        pieces = np.maximum(np.ceil(gaps / _PIECE).astype(int), 1)
+        starts, tips = tree.z[nearest], nearest.copy()
+        free = self.count_free_pieces(starts, goals, pieces)
+        for k in np.flatnonzero(free):
+            share = np.arange(1, free[k] + 1)[:, None] / pieces[k]
+            tips[k] = tree.add_branch(int(nearest[k]), starts[k] + share * (goals[k] - starts[k]))
+        return tips, free == pieces
+
+    def _try_connect(self, tree: _Tree, other: _Tree, tips: Ints) -> Floats | None:
+        """Grow `other` to the nodes `tips` of `tree`; return the path if they meet."""
+        tips = tips[np.isfinite(tree.z[tips]).all(axis=1)]
+        if not len(tips):
+            return None
+        ends, are_reached = self._grow(other, tree.z[tips])
+        for tip, end in zip(tips[are_reached], ends[are_reached], strict=True):
+            path = self._join(tree, int(tip), other, int(end))
+            if path is not None:
+                return path
+        return None
+
+    def _join(self, tree: _Tree, tip: int, other: _Tree, end: int) -> Floats | None:
+        """Return the path through two nodes at the same place if it is free in fine steps.
+
+        Otherwise its blocked edges are cut.
+        """
+        is_whole = True
+        for each, node in ((tree, tip), (other, end)):
+            nodes = each.list_ancestors(node)
+            if not np.isfinite(each.z[nodes]).all():
+                return None
+            if len(nodes) > 1:
+                free = self.are_lines_free(each.z[nodes[1:]], each.z[nodes[:-1]], _FINE_STEP)
+                for blocked in np.flatnonzero(~free):
+                    each.cut(nodes[int(blocked)])
+                is_whole = is_whole and bool(free.all())
+        if not is_whole:
+            return None
+        here, there = tree.list_ancestors(tip), other.list_ancestors(end)
+        return np.vstack([tree.z[here[::-1]], other.z[there[1:]]])
+
+    def measure(self, z: Floats, other: Floats) -> Floats:
+        """Return distances between configurations in the metric of searches."""
+        return np.asarray(np.linalg.norm((z - other) * self.weights, axis=-1))
+
+    def _complete(self, z: Floats) -> Floats:
+        """Return whole configurations, shape (B, n), with robot coordinates z, shape (B, m)."""
+        whole = np.tile(self.first, (len(z), 1))
+        whole[:, : self.size] = z
+        return whole
+
+    def _count_free(self, z: Floats, edges: Ints) -> Ints:
+        reach = self.problem.options.largest_margin
+        free = self.problem.contacts.count_free(
+            self._complete(z), edges, self.waypoint, reach=reach, allowed=self.allowed
+        )
+        self.checks += int(np.minimum(free + 1, np.diff(edges)).sum())
+        return free
+
+    def are_lines_free(self, starts: Floats, ends: Floats, step: float = _CHECK_STEP) -> Bools:
+        """Return which straight lines are free behind their starts, shape (B,).
+
+        Configurations far apart are checked first, since they are most likely to differ.
+        """
+        counts = np.maximum(np.ceil(self.measure(starts, ends) / step).astype(int), 1)
+        shares = [_order_shares(count) for count in counts.tolist()]
+        lines, edges = np.repeat(np.arange(len(counts)), counts), np.cumsum([0, *counts])
+        share = np.concatenate(shares)[:, None]
+        free = self._count_free(starts[lines] + share * (ends - starts)[lines], edges)
+        return np.asarray(free == counts)
+
+    def count_free_pieces(self, starts: Floats, ends: Floats, pieces: Ints) -> Ints:
+        """Return how many pieces of straight lines are free, from their starts on, shape (B,)."""
+        lengths = self.measure(starts, ends) / pieces
+        steps = np.maximum(np.ceil(lengths / _CHECK_STEP).astype(int), 1)
+        counts = pieces * steps
+        lines, edges = np.repeat(np.arange(len(counts)), counts), np.cumsum([0, *counts])
+        share = (np.arange(edges[-1]) - edges[lines] + 1.0) / counts[lines]
+        free = self._count_free(starts[lines] + share[:, None] * (ends - starts)[lines], edges)
+        return np.asarray(free // steps)
+
+    def shorten(self, path: Floats) -> Floats:
+        """Shortcut a path, shape (P, m), between random points on it, then joint by joint."""
+        for _ in range(_SHORTCUTS):
+            passed = self._measure_along(path)
+            first, last = np.sort(self.rng.uniform(0.0, passed[-1], 2))
+            path = self._replace(path, passed, first, last, range(self.size))
+        # A path through a narrow passage with another posture moves all joints. Straight lines in
+        # all coordinates seldom undo that, and the solver cannot, because obstacles are in between
+        # (partial shortcuts: Geraerts and Overmars, IJRR 2007).
+        arm = range(3, self.size)
+        for number in range(1 + _STRAIGHTENING_ROUNDS):
+            for columns in (arm, *([column] for column in arm)):
+                passed = self._measure_along(path)
+                first, last = 0.0, float(passed[-1])
+                if number:
+                    first, last = np.sort(self.rng.uniform(0.0, passed[-1], 2))
+                path = self._replace(path, passed, first, last, columns)
+        return path
+
+    def _measure_along(self, path: Floats) -> Floats:
+        """Return the length of a path up to each of its configurations, shape (P,)."""
+        return np.concatenate([[0.0], np.cumsum(self.measure(path[1:], path[:-1]))])
+
+    def _replace(
+        self, path: Floats, passed: Floats, first: float, last: float, columns: range | list[int]
+    ) -> Floats:
+        """Move some coordinates evenly between two points on a path, if it is free and shorter.
+
+        Args:
+            path: Configurations, shape (P, m).
+            passed: Length of the path up to each of them, shape (P,).
+            first: Length up to the first point.
+            last: Length up to the last point.
+            columns: The coordinates.
+        """
+        inside = (passed > first) & (passed < last)
+        if not inside.any():
+            return path
+        at = np.array([first, *passed[inside], last])
+        old = _interpolate(at, passed, path)
+        new = old.copy()
+        share = ((at - first) / (last - first))[:, None]
+        new[:, columns] = (old[0] + share * (old[-1] - old[0]))[:, columns]
+        if len(columns) == self.size:
+            new = new[[0, -1]]
+        before, after = (self.measure(part[1:], part[:-1]).sum() for part in (old, new))
+        is_shorter = after < (1.0 - _MIN_SAVING) * before
+        if not is_shorter or not self.are_lines_free(new[:-1], new[1:], _FINE_STEP).all():
+            return path
+        return np.vstack([path[passed < first], new, path[passed > last]])
+
+    def resample(self, path: Floats, steps: int) -> Floats:
+        """Return whole configurations along a path, shape (steps, n), slow at both ends.
+
+        The waypoint nearest to a corner is moved there.
+        """
+        passed = self._measure_along(path)
+        at = passed[-1] * sample_smoothstep(steps)
+        detours = np.diff(passed)[1:] + np.diff(passed)[:-1] - self.measure(path[2:], path[:-2])
+        for corner in passed[1:-1][detours > _MIN_DETOUR]:
+            at[int(np.argmin(np.abs(at[:-1] - corner)))] = corner
+        return self._complete(_interpolate(at, passed, path))
+
+
+def _interpolate(at: Floats, passed: Floats, path: Floats) -> Floats:
+    """Return configurations at lengths `at` along a path, shape (A, m)."""
+    return np.stack([np.interp(at, passed, column) for column in path.T], axis=1)
+
+
+@functools.cache
+def _order_shares(count: int) -> Floats:
+    """Return 1/count, 2/count, ..., 1 in an order of bisection: 1, then about 1/2, 1/4, 3/4."""
+    stride, order = count, {count: None}
+    while len(order) < count:
+        stride = max(1, stride // 2)
+        order |= dict.fromkeys(range(stride, count, stride))
+    return np.array(list(order)) / count

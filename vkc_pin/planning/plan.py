@@ -137,6 +137,9 @@ class Plan:
         statistics: Times and counts of planning.
         seed: Random seed.
         initialization: Name of the initial guess it came from.
+        is_optimized: Whether the trajectory is a solution of the nonlinear program. If not, it is
+            the collision-free path of the initial guess itself, retimed: the solver found no
+            solution from there.
         history: One row per round of the solver.
         terms: Constraints and costs of the user, with their expressions as data.
         claimed: Report in the file that the plan was loaded from; else None.
@@ -153,6 +156,7 @@ class Plan:
     statistics: PlanningStatistics = field(default_factory=PlanningStatistics)
     seed: int = 0
     initialization: str = ""
+    is_optimized: bool = True
     history: Sequence[Mapping[str, float]] = field(default_factory=tuple)
     terms: tuple[Term, ...] = ()
     claimed: Report | None = field(default=None, repr=False)
@@ -234,6 +238,7 @@ class Plan:
                 f"{_count(int(m['iterations']), 'Ipopt iteration')}, "
                 f"{_count(self.statistics.evaluations, 'evaluation')}, "
                 f"initial guess {self.initialization}"
+                + ("" if self.is_optimized else ", which is the motion, not optimized")
             ),
             *(f"  {line}" for line in self.report.by_phase(self.trajectory) if len(self.steps) > 1),
             *(f"  {line}" for line in self.report.lines()),
@@ -250,6 +255,7 @@ class Plan:
             "metrics": self.metrics,
             "seed": self.seed,
             "initialization": self.initialization,
+            "is_optimized": self.is_optimized,
             "violations": [asdict(violation) for violation in self.report.violations],
             "notes": list(self.report.notes),
             "bounds": [asdict(bound) for bound in self.report.bounds],
@@ -332,6 +338,7 @@ class Plan:
             "metrics": {**self.metrics, **_measure(self)},
             "seed": self.seed,
             "initialization": self.initialization,
+            "is_optimized": self.is_optimized,
             "history": [dict(row) for row in self.history],
             "terms": [term_to_dict(term) for term in self.terms],
         }
@@ -408,6 +415,7 @@ class Plan:
             statistics=PlanningStatistics.from_metrics(metrics),
             seed=about["seed"],
             initialization=about["initialization"],
+            is_optimized=about["is_optimized"],
             history=tuple(about["history"]),
             terms=tuple(term_from_dict(term) for term in about["terms"]),
             claimed=claimed,

@@ -7,12 +7,15 @@ import dataclasses
 import threading
 from collections.abc import Callable, Iterator, Sequence
 
+import numpy as np
+
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
 from vkc_pin.planning.initialization.methods import Initialization
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.progress import show_progress
-from vkc_pin.planning.request import make_budget, make_request
+from vkc_pin.planning.request import PlanningRequest, make_budget, make_request
+from vkc_pin.planning.results import FINAL, add_statistics
 from vkc_pin.planning.sequential import (
     plan_sequentially,
     plan_simultaneously,
@@ -21,6 +24,7 @@ from vkc_pin.planning.sequential import (
 from vkc_pin.planning.solver.solution import Iteration
 from vkc_pin.planning.window import plan_with_window
 from vkc_pin.utils.arguments import check_bool, check_instance, check_integer, check_number
+from vkc_pin.utils.budget import Budget
 from vkc_pin.utils.cache import Cache, CacheInfo
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actions import compile_each_step
@@ -30,6 +34,9 @@ from vkc_pin.world.task.loads import check_footings, check_loads
 from vkc_pin.world.task.phases import Task, summarize_phases
 from vkc_pin.world.task.steps import Step, as_steps
 from vkc_pin.world.task.terms import Term, check_terms_active
+
+DEFAULT_TIME_LIMIT = 60.0
+"""Wall-clock limit of a planning call [s], unless it gives another."""
 
 __all__ = ["Planner", "acquire_cache", "plan"]
 
@@ -109,7 +116,7 @@ def plan(  # noqa: PLR0913 - keyword options of a public call
     initialization: Initialization = "auto",
     options: Options | None = None,
     callback: Callable[[Iteration], None] | None = None,
-    time_limit: float | None = None,
+    time_limit: float | None = DEFAULT_TIME_LIMIT,
     max_evaluations: int | None = None,
     seed: int = 0,
     simultaneous: bool = True,
@@ -126,11 +133,13 @@ def plan(  # noqa: PLR0913 - keyword options of a public call
         steps: What should change in the world, in this order: `Reach`, `Grasp`, `Actuate`, `Touch`,
             `Place`, `Release`, `GoTo`, `Configure`.
         initialization: Initialization method: "auto", "interpolated", "astar", "rrt" or
-            "stationary".
+            "stationary". "auto" goes on until a limit: with fresh random numbers and longer
+            searches, after all initial guesses have failed.
         options: Options of planning; `Options()` by default.
         callback: Called with an `Iteration` after every round of the solver.
         time_limit: Wall-clock limit of the call [s], after which the best trajectory so far is
             returned with status "time limit". Success then depends on the machine and its load.
+            None: all initial guesses are tried once.
         max_evaluations: Limit on evaluated configurations, by searches for initial guesses and by
             every iteration of Ipopt at each waypoint; the status is then "evaluation limit". It
             does not depend on the speed or load of the machine. 100 000 evaluations take some ten
@@ -184,20 +193,61 @@ def plan(  # noqa: PLR0913 - keyword options of a public call
         )
         check_footings(scene, tasks)
         check_loads(scene, tasks, request.options)
-        if window is not None:
-            found = plan_with_window(ready, steps, window, request)
-        else:
+
+        def search(request: PlanningRequest) -> Plan:
+            if window is not None:
+                return plan_with_window(ready, steps, window, request)
             (task,) = tasks if ready is scene else _compile(ready, steps, request.options)
             # A chain can contain a joint only once.
             if not simultaneous or find_shared_coordinate(ready, task.holds) is not None:
-                found = plan_sequentially(ready, task, request)
-            elif len(task.steps) == 1:
-                found = solve_with_alternatives(ready, task, request).plan
-            else:
-                found = plan_simultaneously(ready, task, request)
-        found = _add_note_on_hand(found, tasks)
+                return plan_sequentially(ready, task, request)
+            if len(task.steps) == 1:
+                return solve_with_alternatives(ready, task, request).plan
+            return plan_simultaneously(ready, task, request)
+
+        found = _search_repeatedly(search, request, budget)
+        found = _add_note_on_hand(_add_note_on_ending(found, budget), tasks)
         line.end(found)
     return found
+
+
+def _search_repeatedly(
+    search: Callable[[PlanningRequest], Plan], request: PlanningRequest, budget: Budget
+) -> Plan:
+    """Search until a plan is a success or proven to be impossible, or until the budget ends.
+
+    Every search doubles the collision checks of trees, and draws other random numbers.
+    """
+    first = search(request)
+    plans, seeds = [first], np.random.SeedSequence(request.random_seed)
+    goes_on = request.initialization == "auto" and budget.is_limited
+    while goes_on and not plans[-1].success and plans[-1].status not in FINAL:
+        before = budget.evaluations
+        (other,) = seeds.spawn(1)
+        seed, effort = int(other.generate_state(1)[0]), 2 * request.effort
+        request = dataclasses.replace(request, random_seed=seed, effort=effort)
+        plans.append(search(request))
+        goes_on = budget.evaluations > before
+    # The first failure has the reasons; later ones end in the middle of a search.
+    last = plans[-1]
+    best = last if last.success or last.status == "infeasible" else first
+    status = best.status if best.status in ("success", "infeasible") else last.status
+    best = dataclasses.replace(best, status=status, seed=first.seed)
+    return add_statistics(best, [each.statistics for each in plans])
+
+
+def _add_note_on_ending(found: Plan, budget: Budget) -> Plan:
+    """Return a plan; if no proof ended its search, with a note on what did."""
+    options = {"time limit": "time_limit", "evaluation limit": "max_evaluations"}
+    if found.status in options:
+        limit = budget.describe_limit()
+        note = f"the limit of {limit} ended the search; a larger {options[found.status]} goes on"
+    elif found.status in ("not converged", "rejected"):
+        note = "the search ended after all initial guesses; with a time_limit it goes on until then"
+    else:
+        return found
+    report = dataclasses.replace(found.report, notes=(*found.report.notes, note))
+    return dataclasses.replace(found, report=report)
 
 
 def _add_note_on_hand(found: Plan, tasks: Sequence[Task]) -> Plan:

@@ -29,6 +29,7 @@ class PlanningRequest:
     Attributes:
         is_draft: Whether solutions of the nonlinear program are returned as they are, neither
             retimed nor validated: initial guesses for a larger problem, whose solution is.
+        effort: Factor of the collision checks of searches with trees; see `planner.plan`.
         is_tentative: Whether planning gives up if the goals of its first initial guess seem to be
             blocked, as steps before can be planned again with another grasp.
     """
@@ -41,6 +42,7 @@ class PlanningRequest:
     terms: tuple[Term, ...] = ()
     progress: Progress = field(default_factory=Progress)
     cache: Cache = field(default_factory=Cache)
+    effort: int = 1
     is_draft: bool = False
     is_tentative: bool = False
 

@@ -117,6 +117,7 @@ def concatenate_plans(
         statistics=total,
         seed=request.random_seed,
         initialization=name,
+        is_optimized=all(part.is_optimized for part in parts),
         history=tuple(rows),
         terms=request.terms,
     )

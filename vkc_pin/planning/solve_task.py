@@ -26,6 +26,7 @@ from vkc_pin.planning.initialization.initial_guess import (
     make_initial_guess,
 )
 from vkc_pin.planning.initialization.methods import initialize
+from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.plan import STAGES, Plan, PlanningStatistics
 from vkc_pin.planning.request import PlanningRequest
@@ -197,6 +198,7 @@ class TaskSearch:
             statistics=self.statistics,
             seed=request.random_seed,
             initialization=best.name,
+            is_optimized=best.is_optimized,
             history=tuple(search.history),
             terms=request.terms,
             is_validated=best.is_validated,
@@ -217,6 +219,7 @@ class _Candidate:
     report: Report
     status: PlanStatus
     is_validated: bool = True
+    is_optimized: bool = True
 
     @property
     def violation(self) -> float:
@@ -330,6 +333,8 @@ class _Search:
     ) -> tuple[_Candidate, PlanStatus] | None:
         """Return the outcome if a guess leads to a solution, or if the budget ended there."""
         solution = self._solve_from(problem, start)
+        if self._best is None or self._best.status != "success":
+            self._add_guess(problem, start)
         if self._best is not None and self._best.status == "success":
             return self._best, "success"
         if self._best is not None and solution.status in STOP_STATUSES and not solution.shortfall:
@@ -403,6 +408,22 @@ class _Search:
             self._best = candidate
         return candidate
 
+    def _add_guess(self, problem: TrajectoryProblem, guess: InitialGuess) -> None:
+        """Keep an initial guess itself if it is valid, though the solver found no solution from it.
+
+        The solver may leave a corridor that a search has found.
+        """
+        z = problem.clip(guess.z)
+        timing = problem.timing_for(z)
+        with suspend_budget():
+            contacts = problem.evaluate_contacts(z, reach=problem.options.largest_margin, nearest=1)
+        is_free = contacts.compute_violation() <= ACCEPTED_SHORTFALL
+        if is_free and problem.row_error(z, timing.dt) <= TOLERANCE:
+            solution = Solution(z, timing.dt, converged=True)
+            found = self._evaluate(problem, solution, guess.name, is_optimized=False)
+            if found.status == "success":
+                self._best = found
+
     def _explain_failure(
         self, problem: TrajectoryProblem, goals: list[BlockedGoal]
     ) -> tuple[_Candidate, PlanStatus]:
@@ -468,6 +489,7 @@ class _Search:
             request.initialization,
             request.random_seed,
             count=request.options.max_restarts,
+            effort=request.effort,
             perturbation=request.perturbation,
             notes=self._blocked_phases,
             is_infeasible=lambda phases: (
@@ -493,14 +515,21 @@ class _Search:
         if self.request.callback is not None:
             self.request.callback(row)
 
-    def _evaluate(self, problem: TrajectoryProblem, solution: Solution, name: str) -> _Candidate:
+    def _evaluate(
+        self,
+        problem: TrajectoryProblem,
+        solution: Solution,
+        name: str,
+        *,
+        is_optimized: bool = True,
+    ) -> _Candidate:
         """Retime and validate a solution; around violations the curve is refined.
 
-        A converged solution of a draft is left as it is.
+        A converged solution of a draft is left as it is, unless it is an initial guess.
         """
         with suspend_budget():
             waypoints = make_trajectory(problem, solution.z, solution.dt)
-        if self.request.is_draft and solution.converged:
+        if self.request.is_draft and solution.converged and is_optimized:
             self.check_time = _CHECK_TIME * problem.segments
             return _Candidate(name, problem, solution.z, waypoints, Report(), "success", False)
         began, validated = time.perf_counter(), self.times["validation"]
@@ -518,7 +547,9 @@ class _Search:
         self.times["retiming"] += took - (self.times["validation"] - validated)
         failure: PlanStatus = "rejected" if solution.converged else "not converged"
         status = "success" if report.ok else failure
-        return _Candidate(name, problem, solution.z, trajectory, report, status)
+        return _Candidate(
+            name, problem, solution.z, trajectory, report, status, is_optimized=is_optimized
+        )
 
     def _validate(self, trajectory: Trajectory) -> Report:
         began, request = time.perf_counter(), self.request

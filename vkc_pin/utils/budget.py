@@ -59,6 +59,7 @@ class Budget:
     """
 
     def __init__(self, seconds: float | None = None, max_evaluations: int | None = None) -> None:
+        self._seconds, self._max_evaluations = seconds, max_evaluations
         deadline = math.inf if seconds is None else time.perf_counter() + seconds
         self.limits = deadline, math.inf if max_evaluations is None else max_evaluations
         self.share: Callable[[], tuple[float, float]] | None = None
@@ -74,6 +75,17 @@ class Budget:
         if self.evaluations > max_evaluations:
             return "evaluation limit"
         return "time limit" if self.end_time > deadline else ""
+
+    def describe_limit(self) -> str:
+        """Return the limit of time or evaluations that is reached, as "60 s"."""
+        if self.stop_status == "evaluation limit":
+            return f"{self._max_evaluations} evaluations"
+        return f"{self._seconds:g} s"
+
+    @property
+    def is_limited(self) -> bool:
+        """Whether there is a limit of time or evaluations."""
+        return min(self.limits) < math.inf
 
     @property
     def end_time(self) -> float:

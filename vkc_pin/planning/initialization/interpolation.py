@@ -72,8 +72,9 @@ class CurvePaths:
 class RrtPaths:
     """Paths of base and arm by RRT: guided by a base path, or constrained to a closed chain."""
 
-    def __init__(self, sampler: KeyframeSampler, routes: BaseRoutes) -> None:
+    def __init__(self, sampler: KeyframeSampler, routes: BaseRoutes, *, effort: int = 1) -> None:
         self.sampler, self.problem, self.routes = sampler, sampler.problem, routes
+        self.effort = effort  # factor of the collision checks
         self._failures: Counter[int] = Counter()  # consecutive ones per phase
 
     def find_path(
@@ -104,7 +105,7 @@ class RrtPaths:
             first,
             ends,
             steps,
-            FIRST_CHECKS * 2 ** (number // 2),
+            self.effort * FIRST_CHECKS * 2 ** (number // 2),
             Guide(poses, arms),
             allowed=0.0 if number % 2 else problem.options.dist_safe,
         )

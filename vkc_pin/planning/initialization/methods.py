@@ -46,6 +46,7 @@ def initialize(
     random_seed: int,
     *,
     count: int = 1,
+    effort: int = 1,
     perturbation: float = 0.0,
     notes: list[str] | None = None,
     is_infeasible: Callable[[Sequence[int]], bool] = lambda _: False,
@@ -63,6 +64,7 @@ def initialize(
             arm that two random trees find. "auto": these three, interleaved.
         random_seed: Random seed.
         count: Maximum number of guesses per method.
+        effort: Factor of the collision checks of searches with trees.
         perturbation: Standard deviation of smooth noise on the robot's coordinates [m] or [rad].
         notes: List that receives a line for every phase without a base path.
         is_infeasible: Called by "auto" before trees grow, with the numbers of the phases at whose
@@ -74,7 +76,8 @@ def initialize(
         guesses = _generate_stationary_guesses(problem, 2 * count - 1, rng)
     else:
         notes = [] if notes is None else notes
-        shared = _Shared(problem, random_seed, notes, BaseRoutes(problem), KeyframeCache())
+        routes, cache = BaseRoutes(problem), KeyframeCache()
+        shared = _Shared(problem, random_seed, notes, routes, cache, effort)
         if method == "auto":
             kinds = ("interpolated", "astar", "rrt")
             guesses = interleave_guesses(
@@ -165,6 +168,7 @@ class _Shared:
     notes: list[str]
     routes: BaseRoutes
     cache: KeyframeCache
+    effort: int
 
     @property
     def driving_routes(self) -> BaseRoutes | None:
@@ -289,7 +293,9 @@ class _RrtSearch(_GuessSearch):
         sampler = shared.make_sampler()
         beam = BeamSearch(sampler, shared.driving_routes, for_narrow_passages=True)
         return beam, Interpolator(
-            sampler, ApproachPaths(sampler, keeps_base_fixed=True), RrtPaths(sampler, shared.routes)
+            sampler,
+            ApproachPaths(sampler, keeps_base_fixed=True),
+            RrtPaths(sampler, shared.routes, effort=shared.effort),
         )
 
     def _search(self, attempt: int) -> SearchResult | None:

@@ -15,6 +15,7 @@ Three choices decide how soon an arm finds its way out of a shelf or a cage:
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -319,7 +320,7 @@ class _TreeSearch:
         return np.concatenate([[0.0], np.cumsum(self.measure(path[1:], path[:-1]))])
 
     def _replace(
-        self, path: Floats, passed: Floats, first: float, last: float, columns: range | list[int]
+        self, path: Floats, passed: Floats, first: float, last: float, columns: Sequence[int]
     ) -> Floats:
         """Move some coordinates evenly between two points on a path, if it is free and shorter.
 

@@ -223,6 +223,7 @@ class _About(Schema):
     metrics: _Metrics  # type: ignore[valid-type]
     seed: Count
     initialization: Text
+    is_optimized: bool = True  # it is missing in older files
     history: Annotated[list[dict[str, Recorded]], FailFast()]
     terms: Annotated[list[dict[str, Any]], FailFast()] = Field(default_factory=list)
 

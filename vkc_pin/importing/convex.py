@@ -58,6 +58,7 @@ _CORNERS = 40  # largest number of vertices of a piece, as in the packaged colli
 _CORNER_TOLERANCE = 1.5
 # Multiples of the vertex limit that are tried in turn while pieces protrude too far
 _CORNER_FACTORS = (1, 2, 4)
+_CONVEX = 1e-4  # [m] protrusion of the hull of a mesh that counts as convex
 # Of the error: part of a piece's protrusion that comes of few vertices and is not worth more
 _CORNER_SHARE = 0.2
 _FLATNESS = 1e-4  # [m] thickness up to which parts become plates
@@ -151,7 +152,8 @@ def decompose(
             whole, wherever it protrudes.
         corners: Largest number of vertices. A piece with half as many again is replaced by an
             enclosing polytope; where the pieces would then protrude by more than `error`, by one
-            with up to four times as many, or not at all.
+            with up to four times as many, or not at all. A mesh that is convex keeps its hull of up
+            to six times as many.
 
     Raises:
         InputError: The mesh cannot be read or is empty, or an argument is invalid.
@@ -254,6 +256,9 @@ def _simplify(
     Those that protrude far over their piece get more vertices, up to all, while the pieces miss
     `error` [m] or are not sufficient: protrusions block motions, vertices cost little time.
     """
+    most = _CORNER_TOLERANCE * _CORNER_FACTORS[-1] * corners
+    if exact.error <= _CONVEX and all(len(piece.vertices) <= most for piece in exact.meshes):
+        return exact
     slack = _CORNER_SHARE * error
     aim = error if exact.error <= error else exact.error + slack
     pieces = list(exact.meshes)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +18,7 @@ from vkc_pin.planning.initialization.base_routes import BaseRoutes
 from vkc_pin.planning.initialization.beam_search import BeamSearch
 from vkc_pin.planning.initialization.interpolation import AStarPaths, Interpolator, Paths, RrtPaths
 from vkc_pin.planning.initialization.keyframes import KeyframeSampler, sample_smoothstep
+from vkc_pin.planning.initialization.open_trees import OpenSearch
 
 FEW = vkc.Options(reach_waypoints=20, turn_waypoints=6, move_waypoints=20)
 ROBOT_SIZE = 9  # x, y and yaw of the base, six joints of the arm
@@ -180,10 +180,10 @@ def test_searches_get_longer_after_failures(monkeypatch: pytest.MonkeyPatch) -> 
     p = make_program(scene, [vkc.GoTo(*GOAL), vkc.GoTo(*GOAL[:2], 1.0)])
     paths, limits = make_rrt_paths(p), list[tuple[int, float]]()
 
-    def fail(*arguments: Any, allowed: float) -> None:
-        limits.append((arguments[5], allowed))
+    def fail(search: OpenSearch, steps: int, max_checks: int) -> None:
+        limits.append((max_checks, search.allowed))
 
-    monkeypatch.setattr(interpolation, "find_open_path", fail)
+    monkeypatch.setattr(OpenSearch, "find_path", fail)
     end = make_waypoint(p, GOAL)
     for phase in (0, 0, 0, 0, 1):
         assert paths.find_path(phase, p.start, end, 9, turns=False, reaches=True) is None

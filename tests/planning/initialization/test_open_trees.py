@@ -17,7 +17,7 @@ import vkc_pin as vkc
 from vkc_pin.planning.initialization import open_trees
 from vkc_pin.planning.initialization.base_routes import BaseRoutes
 from vkc_pin.planning.initialization.keyframes import KeyframeSampler
-from vkc_pin.planning.initialization.open_trees import Guide, find_open_path
+from vkc_pin.planning.initialization.open_trees import Guide, OpenSearch
 from vkc_pin.utils.budget import Budget
 
 METRIC = np.array([2.0, 2.0, *np.ones(7)])  # x, y and yaw of the base, six joints of the arm
@@ -70,7 +70,8 @@ def connect(
     sampler = make_sampler(problem, seed)
     allowed = problem.options.dist_safe if allowed is None else allowed
     guide = Guide(poses, arms)
-    path = find_open_path(sampler, 0, first, ends, STEPS, max_checks, guide, allowed=allowed)
+    search = OpenSearch(sampler, 0, first, ends, guide, allowed=allowed)
+    path = search.find_path(STEPS, max_checks)
     return None if path is None else np.vstack([first, path])
 
 

@@ -15,7 +15,7 @@ from vkc_pin.planning.initialization.closed_trees import (
     needs_trees,
 )
 from vkc_pin.planning.initialization.keyframes import KeyframeSampler, sample_smoothstep
-from vkc_pin.planning.initialization.open_trees import Guide, find_open_path
+from vkc_pin.planning.initialization.open_trees import Guide, OpenSearch
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.task.phases import Phase
 
@@ -76,6 +76,8 @@ class RrtPaths:
         self.sampler, self.problem, self.routes = sampler, sampler.problem, routes
         self.effort = effort  # factor of the collision checks
         self._failures: Counter[int] = Counter()  # consecutive ones per phase
+        # What the last search for an open path, if it failed, found between start and goal.
+        self.obstruction: tuple[str, str] | None = None
 
     def find_path(
         self, phase: int, first: Floats, last: Floats, steps: int, *, turns: bool, reaches: bool
@@ -83,6 +85,7 @@ class RrtPaths:
         """See `AStarPaths.find_path`."""
         problem, arm = self.problem, slice(3, self.sampler.robot_size)
         poses, last = first[None, :3], last.copy()
+        self.obstruction = None
         if problem.chain.robot.base != "fixed":
             guide = self.routes.find_guide_path(phase, first[:3], last[:3], 2 * steps)
             if guide is None:
@@ -99,17 +102,12 @@ class RrtPaths:
         arms = np.array([start, goal, problem.chain.robot.home, folded, nearest])
         ends = last[None] if reaches else self._list_ends(phase, last, arms)
         number = self._failures[phase]
-        path = find_open_path(
-            self.sampler,
-            phase,
-            first,
-            ends,
-            steps,
-            self.effort * FIRST_CHECKS * 2 ** (number // 2),
-            Guide(poses, arms),
-            allowed=0.0 if number % 2 else problem.options.dist_safe,
-        )
+        allowed = 0.0 if number % 2 else problem.options.dist_safe
+        where = Guide(poses, arms)
+        search = OpenSearch(self.sampler, phase, first, ends, where, allowed=allowed)
+        path = search.find_path(steps, self.effort * FIRST_CHECKS * 2 ** (number // 2))
         self._count_failures(phase, path)
+        self.obstruction = search.find_obstruction() if path is None else None
         return None if path is None else path[:, : arm.stop]
 
     def _list_ends(self, phase: int, last: Floats, arms: Floats) -> Floats:
@@ -236,10 +234,7 @@ class Interpolator:
                 number, through[leave], through[arrive], steps, turns=turns, reaches=reaches
             )
             if path is None:
-                blocked = f"{phase.name}: found no path for the base"
-                (x, y), (u, v) = through[[leave, arrive], :2]
-                if not any(note.startswith(blocked) for note in self.blocked):
-                    self.blocked.append(f"{blocked} from ({x:.2f}, {y:.2f}) to ({u:.2f}, {v:.2f})")
+                self._note_missing_path(phase, *through[[leave, arrive], :2])
                 return False
             turned = path[-1, 2] - through[arrive, 2]  # later headings continue from there
             through[arrive:, 2] += turned
@@ -249,6 +244,23 @@ class Interpolator:
             z[when[leave] : when[arrive], : path.shape[1]] = path
             keyframes[inside[-1], : path.shape[1]] = z[-1, : path.shape[1]]
         return True
+
+    def _note_missing_path(self, phase: Phase, start: Floats, end: Floats) -> None:
+        """Note that a phase has no path of the base between places on the floor, shape (2,)."""
+        obstruction = self.paths.obstruction if isinstance(self.paths, RrtPaths) else None
+        if self.problem.chain.robot.base == "fixed":
+            text = "found no path for the arm"
+        else:
+            text = "found no path for the base"
+        if any(note.startswith(f"{phase.name}: {text}") for note in self.blocked):
+            return
+        if self.problem.chain.robot.base != "fixed":
+            (x, y), (u, v) = start, end
+            text += f" from ({x:.2f}, {y:.2f}) to ({u:.2f}, {v:.2f})"
+        if obstruction is not None:
+            first, second = obstruction
+            text += f": between start and goal, {first} meets {second}"
+        self.blocked.append(f"{phase.name}: {text}")
 
     def _find_via_points(
         self, ends: Floats, number: int, previous: Phase | None, segments: int

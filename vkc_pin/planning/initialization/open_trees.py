@@ -27,7 +27,7 @@ from vkc_pin.planning.initialization.keyframes import (
 )
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 
-__all__ = ["Guide", "find_open_path"]
+__all__ = ["Guide", "OpenSearch"]
 
 _PIECE = 1.0  # longest edge of a tree, in the metric of searches: [rad] of a joint
 _CHECK_STEP, _FINE_STEP = 0.05, 0.01  # between collision checks while trees grow, and of the result
@@ -52,39 +52,6 @@ class Guide(NamedTuple):
 
     poses: Floats
     arms: Floats
-
-
-def find_open_path(
-    sampler: KeyframeSampler,
-    phase: int,
-    first: Floats,
-    ends: Floats,
-    steps: int,
-    max_checks: int,
-    guide: Guide,
-    *,
-    allowed: float,
-) -> Floats | None:
-    """Find waypoints of the robot in an open phase.
-
-    Args:
-        sampler: Keyframe sampler of the problem.
-        phase: Number of the phase.
-        first: Start configuration, shape (n,); coordinates outside the robot stay constant.
-        ends: Possible end configurations, shape (E, n). If all of them lack more than `allowed`,
-            the least violating one is used unless it is deep in collision.
-        steps: Number of waypoints.
-        max_checks: Number of collision checks after which the search ends.
-        guide: Where samples are likely to be needed.
-        allowed: Clearance that configurations may lack [m].
-
-    Returns:
-        Waypoints, shape (steps, n), those at corners included where there are fewer corners than
-        waypoints; None if no path was found.
-    """
-    search = _TreeSearch(sampler, phase, first, ends, guide, allowed)
-    path = search.connect(max_checks)
-    return None if path is None else search.resample(search.shorten(path), steps)
 
 
 class _Tree:
@@ -138,8 +105,18 @@ class _Tree:
         return nearest, np.linalg.norm(self.scaled[nearest] - scaled, axis=1)
 
 
-class _TreeSearch:
-    """Searches a path of the robot's coordinates in one phase."""
+class OpenSearch:
+    """Searches a path of the robot's coordinates, z of shape (m,), in an open phase.
+
+    Args:
+        sampler: Keyframe sampler of the problem.
+        phase: Number of the phase.
+        first: Start configuration, shape (n,); coordinates outside the robot stay constant.
+        ends: Possible end configurations, shape (E, n). If all of them lack more than `allowed`,
+            the least violating one is used unless it is deep in collision.
+        guide: Where samples are likely to be needed.
+        allowed: Clearance that configurations may lack [m].
+    """
 
     def __init__(
         self,
@@ -148,9 +125,10 @@ class _TreeSearch:
         first: Floats,
         ends: Floats,
         guide: Guide,
+        *,
         allowed: float,
     ) -> None:
-        self.problem, self.rng, self.guide = sampler.problem, sampler.rng, guide
+        self.problem, self.rng, self.guide, self.phase = sampler.problem, sampler.rng, guide, phase
         self.waypoint = self.problem.contacts.find_waypoint(phase)
         self.first, self.size = first, sampler.robot_size
         self.weights = sampler.weights[: self.size]
@@ -171,29 +149,64 @@ class _TreeSearch:
         self.allowed = max(allowed, min(needed, 2.0 * self.problem.options.dist_safe))
         self.ends = self.ends[ending <= self.allowed]
         self.has_ends = needed <= self.allowed
+        self.trees = _Tree(self.start, self.weights), _Tree(self.ends, self.weights)
 
     def _compute_shortfall(self, z: Floats) -> Floats:
         return compute_shortfall(self.problem, self._complete(z), self.waypoint)
 
-    def connect(self, max_checks: int) -> Floats | None:
-        """Find a path from the start to one of the ends, shape (P, m); None if there is none."""
+    def find_path(self, steps: int, max_checks: int) -> Floats | None:
+        """Find waypoints, shape (steps, n); None if no path was found.
+
+        Corners of the path are waypoints if there are fewer of them than waypoints.
+
+        Args:
+            steps: Number of waypoints.
+            max_checks: Number of collision checks after which the search ends.
+        """
+        path = self._connect(max_checks) if self.has_ends else None
+        return None if path is None else self._resample(self._shorten(path), steps)
+
+    def find_obstruction(self) -> tuple[str, str] | None:
+        """Return the names of what collides first between the places where the trees are nearest.
+
+        None: one of the ends is in collision.
+        """
         if not self.has_ends:
             return None
-        trees = _Tree(self.start, self.weights), _Tree(self.ends, self.weights)
-        tips, grown = np.arange(len(self.ends)), 1
+        one, other = self.trees
+        nearest, gaps = one.find_nearest(other.scaled / self.weights)
+        k = int(gaps.argmin())
+        start, end = one.z[nearest[k]], other.z[k]
+        count = max(int(np.ceil(gaps[k] / _FINE_STEP)), 1)
+        line = self._complete(start + np.arange(1, count + 1)[:, None] / count * (end - start))
+        contacts = self.problem.contacts.evaluate(
+            line,
+            np.full(count, self.waypoint),
+            reach=self.problem.options.largest_margin,
+            nearest=1,
+        )
+        wrong = np.flatnonzero(contacts.margin - contacts.distance > self.allowed)
+        if not len(wrong):
+            return None
+        labels = self.problem.contacts.phases[self.phase].labels
+        first, second = contacts.pair[wrong[0]]
+        return labels[first], labels[second]
+
+    def _connect(self, max_checks: int) -> Floats | None:
+        """Find a path from the start to one of the ends, shape (P, m); None if there is none."""
+        trees, tips, grown = self.trees, np.arange(len(self.ends)), 1
         while True:
-            one, other = trees[grown], trees[1 - grown]
-            path = self._try_connect(one, other, tips)
+            path = self._try_connect(trees[grown], trees[1 - grown], tips)
             if path is not None:
                 return path if grown == 0 else path[::-1]
             if self.checks >= max_checks:
                 return None
             grown = 0 if len(trees[0]) <= len(trees[1]) else 1
             before = len(trees[grown])
-            tips = np.unique(self._grow(trees[grown], self.sample())[0])
+            tips = np.unique(self._grow(trees[grown], self._sample())[0])
             tips = tips[tips >= before]
 
-    def sample(self) -> Floats:
+    def _sample(self) -> Floats:
         """Sample configurations, shape (_SAMPLES, m): half of them near the guide."""
         half = _SAMPLES // 2
         z = self.rng.uniform(self.lowest, self.highest, (_SAMPLES, self.size))
@@ -218,7 +231,7 @@ class _TreeSearch:
         nearest, gaps = tree.find_nearest(goals)
         pieces = np.maximum(np.ceil(gaps / _PIECE).astype(int), 1)
         starts, tips = tree.z[nearest], nearest.copy()
-        free = self.count_free_pieces(starts, goals, pieces)
+        free = self._count_free_pieces(starts, goals, pieces)
         for k in np.flatnonzero(free):
             share = np.arange(1, free[k] + 1)[:, None] / pieces[k]
             tips[k] = tree.add_branch(int(nearest[k]), starts[k] + share * (goals[k] - starts[k]))
@@ -247,7 +260,7 @@ class _TreeSearch:
             if not np.isfinite(each.z[nodes]).all():
                 return None
             if len(nodes) > 1:
-                free = self.are_lines_free(each.z[nodes[1:]], each.z[nodes[:-1]], _FINE_STEP)
+                free = self._are_lines_free(each.z[nodes[1:]], each.z[nodes[:-1]], _FINE_STEP)
                 for blocked in np.flatnonzero(~free):
                     each.cut(nodes[int(blocked)])
                 is_whole = is_whole and bool(free.all())
@@ -256,7 +269,7 @@ class _TreeSearch:
         here, there = tree.list_ancestors(tip), other.list_ancestors(end)
         return np.vstack([tree.z[here[::-1]], other.z[there[1:]]])
 
-    def measure(self, z: Floats, other: Floats) -> Floats:
+    def _measure(self, z: Floats, other: Floats) -> Floats:
         """Return distances between configurations in the metric of searches."""
         return np.asarray(np.linalg.norm((z - other) * self.weights, axis=-1))
 
@@ -274,21 +287,21 @@ class _TreeSearch:
         self.checks += int(np.minimum(free + 1, np.diff(edges)).sum())
         return free
 
-    def are_lines_free(self, starts: Floats, ends: Floats, step: float = _CHECK_STEP) -> Bools:
+    def _are_lines_free(self, starts: Floats, ends: Floats, step: float = _CHECK_STEP) -> Bools:
         """Return which straight lines are free behind their starts, shape (B,).
 
         Configurations far apart are checked first, since they are most likely to differ.
         """
-        counts = np.maximum(np.ceil(self.measure(starts, ends) / step).astype(int), 1)
+        counts = np.maximum(np.ceil(self._measure(starts, ends) / step).astype(int), 1)
         shares = [_order_shares(count) for count in counts.tolist()]
         lines, edges = np.repeat(np.arange(len(counts)), counts), np.cumsum([0, *counts])
         share = np.concatenate(shares)[:, None]
         free = self._count_free(starts[lines] + share * (ends - starts)[lines], edges)
         return np.asarray(free == counts)
 
-    def count_free_pieces(self, starts: Floats, ends: Floats, pieces: Ints) -> Ints:
+    def _count_free_pieces(self, starts: Floats, ends: Floats, pieces: Ints) -> Ints:
         """Return how many pieces of straight lines are free, from their starts on, shape (B,)."""
-        lengths = self.measure(starts, ends) / pieces
+        lengths = self._measure(starts, ends) / pieces
         steps = np.maximum(np.ceil(lengths / _CHECK_STEP).astype(int), 1)
         counts = pieces * steps
         lines, edges = np.repeat(np.arange(len(counts)), counts), np.cumsum([0, *counts])
@@ -296,7 +309,7 @@ class _TreeSearch:
         free = self._count_free(starts[lines] + share[:, None] * (ends - starts)[lines], edges)
         return np.asarray(free // steps)
 
-    def shorten(self, path: Floats) -> Floats:
+    def _shorten(self, path: Floats) -> Floats:
         """Shortcut a path, shape (P, m), between random points on it, then joint by joint."""
         for _ in range(_SHORTCUTS):
             passed = self._measure_along(path)
@@ -317,7 +330,7 @@ class _TreeSearch:
 
     def _measure_along(self, path: Floats) -> Floats:
         """Return the length of a path up to each of its configurations, shape (P,)."""
-        return np.concatenate([[0.0], np.cumsum(self.measure(path[1:], path[:-1]))])
+        return np.concatenate([[0.0], np.cumsum(self._measure(path[1:], path[:-1]))])
 
     def _replace(
         self, path: Floats, passed: Floats, first: float, last: float, columns: Sequence[int]
@@ -341,20 +354,20 @@ class _TreeSearch:
         new[:, columns] = (old[0] + share * (old[-1] - old[0]))[:, columns]
         if len(columns) == self.size:
             new = new[[0, -1]]
-        before, after = (self.measure(part[1:], part[:-1]).sum() for part in (old, new))
+        before, after = (self._measure(part[1:], part[:-1]).sum() for part in (old, new))
         is_shorter = after < (1.0 - _MIN_SAVING) * before
-        if not is_shorter or not self.are_lines_free(new[:-1], new[1:], _FINE_STEP).all():
+        if not is_shorter or not self._are_lines_free(new[:-1], new[1:], _FINE_STEP).all():
             return path
         return np.vstack([path[passed < first], new, path[passed > last]])
 
-    def resample(self, path: Floats, steps: int) -> Floats:
+    def _resample(self, path: Floats, steps: int) -> Floats:
         """Return whole configurations along a path, shape (steps, n), slow at both ends.
 
         The waypoint nearest to a corner is moved there.
         """
         passed = self._measure_along(path)
         at = passed[-1] * sample_smoothstep(steps)
-        detours = np.diff(passed)[1:] + np.diff(passed)[:-1] - self.measure(path[2:], path[:-2])
+        detours = np.diff(passed)[1:] + np.diff(passed)[:-1] - self._measure(path[2:], path[:-2])
         for corner in passed[1:-1][detours > _MIN_DETOUR]:
             at[int(np.argmin(np.abs(at[:-1] - corner)))] = corner
         return self._complete(_interpolate(at, passed, path))

@@ -324,7 +324,7 @@ def test_another_robot_reaches_a_pose() -> None:
     [
         ({"initialization": "interpolate"}, "initialization", "did you mean 'interpolated'"),
         ({"time_limit": 0.0}, "time_limit", "more than 0"),
-        ({"time_limit": float("inf")}, "time_limit", "inf"),
+        ({"time_limit": float("-inf")}, "time_limit", "-inf"),
         ({"time_limit": float("nan")}, "time_limit", "nan"),
         ({"time_limit": "5"}, "time_limit", "'5'"),
         ({"max_evaluations": 0}, "max_evaluations", "at least 1"),

@@ -35,9 +35,6 @@ from vkc_pin.world.task.phases import Task, summarize_phases
 from vkc_pin.world.task.steps import Step, as_steps
 from vkc_pin.world.task.terms import Term, check_terms_active
 
-DEFAULT_TIME_LIMIT = 60.0
-"""Wall-clock limit of a planning call [s], unless it gives another."""
-
 __all__ = ["Planner", "acquire_cache", "plan"]
 
 
@@ -116,7 +113,7 @@ def plan(  # noqa: PLR0913 - keyword options of a public call
     initialization: Initialization = "auto",
     options: Options | None = None,
     callback: Callable[[Iteration], None] | None = None,
-    time_limit: float | None = DEFAULT_TIME_LIMIT,
+    time_limit: float | None = None,
     max_evaluations: int | None = None,
     seed: int = 0,
     simultaneous: bool = True,
@@ -133,13 +130,13 @@ def plan(  # noqa: PLR0913 - keyword options of a public call
         steps: What should change in the world, in this order: `Reach`, `Grasp`, `Actuate`, `Touch`,
             `Place`, `Release`, `GoTo`, `Configure`.
         initialization: Initialization method: "auto", "interpolated", "astar", "rrt" or
-            "stationary". "auto" goes on until a limit: with fresh random numbers and longer
-            searches, after all initial guesses have failed.
+            "stationary". If all initial guesses of "auto" have failed, it goes on with fresh random
+            numbers and longer searches until a limit, if there is one.
         options: Options of planning; `Options()` by default.
         callback: Called with an `Iteration` after every round of the solver.
         time_limit: Wall-clock limit of the call [s], after which the best trajectory so far is
             returned with status "time limit". Success then depends on the machine and its load.
-            None: all initial guesses are tried once.
+            Default: 60 s, or none if `max_evaluations` is given; `math.inf`: none.
         max_evaluations: Limit on evaluated configurations, by searches for initial guesses and by
             every iteration of Ipopt at each waypoint; the status is then "evaluation limit". It
             does not depend on the speed or load of the machine. 100 000 evaluations take some ten

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -17,6 +18,9 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.terms import Term, trace_terms
 
 __all__ = ["PlanningRequest", "check_arguments", "make_budget", "make_request"]
+
+DEFAULT_TIME_LIMIT = 60.0
+"""Wall-clock limit of a planning call that gives no limit [s]."""
 
 MAX_PERTURBATION = 3.0
 """Largest standard deviation of noise on initial guesses, [m] and [rad]."""
@@ -74,13 +78,18 @@ def make_request(
 
 
 def make_budget(time_limit: object, max_evaluations: object) -> Budget:
-    """Return the budget of a planning call, which starts now. Raises `InputError`."""
-    if time_limit is not None:
-        expected = "a finite time [s], more than 0, or None"
-        time_limit = check_number(time_limit, "time_limit", expected, low=0.0, strict=True)
+    """Return the budget of a planning call, which starts now. Raises `InputError`.
+
+    Without any limit, it is `DEFAULT_TIME_LIMIT`.
+    """
     if max_evaluations is not None:
         max_evaluations = check_integer(max_evaluations, "max_evaluations", low=1)
-    return Budget(time_limit, max_evaluations)
+    if time_limit is None:
+        time_limit = DEFAULT_TIME_LIMIT if max_evaluations is None else math.inf
+    expected = "a time [s], more than 0; inf: no limit"
+    if time_limit != math.inf:
+        time_limit = check_number(time_limit, "time_limit", expected, low=0.0, strict=True)
+    return Budget(None if time_limit == math.inf else float(time_limit), max_evaluations)
 
 
 def check_arguments(scene: object, options: object, seed: object) -> None:

@@ -83,32 +83,33 @@ class RrtPaths:
         self, phase: int, first: Floats, last: Floats, steps: int, *, turns: bool, reaches: bool
     ) -> Floats | None:
         """See `AStarPaths.find_path`."""
-        problem, arm = self.problem, slice(3, self.sampler.robot_size)
-        poses, last = first[None, :3], last.copy()
-        self.obstruction = None
+        problem, size = self.problem, self.sampler.robot_size
+        self.obstruction, guide, last = None, None, last.copy()
+        arms = self._list_postures(phase, first[3:size], last[3:size])
         if problem.chain.robot.base != "fixed":
-            guide = self.routes.find_guide_path(phase, first[:3], last[:3], 2 * steps)
-            if guide is None:
+            poses = self.routes.find_guide_path(phase, first[:3], last[:3], 2 * steps)
+            if poses is None:
                 return None
-            turned = 2 * np.pi * np.rint((guide[-1, 2] - last[2]) / (2 * np.pi))
+            turned = 2 * np.pi * np.rint((poses[-1, 2] - last[2]) / (2 * np.pi))
             if turns:
                 last[2] += turned
             else:
-                guide[:, 2] -= turned  # the trees find where the base can turn
-            poses = guide
-        start, goal = first[arm], last[arm]
-        folded = self.routes.get_folded_arm(phase)
-        nearest = self.routes.find_nearest_folded_arm(phase, start, goal)
-        arms = np.array([start, goal, problem.chain.robot.home, folded, nearest])
+                poses[:, 2] -= turned  # the trees find where the base can turn
+            guide = Guide(poses, arms)
         ends = last[None] if reaches else self._list_ends(phase, last, arms)
         number = self._failures[phase]
         allowed = 0.0 if number % 2 else problem.options.dist_safe
-        where = Guide(poses, arms)
-        search = OpenSearch(self.sampler, phase, first, ends, where, allowed=allowed)
+        search = OpenSearch(self.sampler, phase, first, ends, guide, allowed=allowed)
         path = search.find_path(steps, self.effort * FIRST_CHECKS * 2 ** (number // 2))
         self._count_failures(phase, path)
         self.obstruction = search.find_obstruction() if path is None else None
-        return None if path is None else path[:, : arm.stop]
+        return None if path is None else path[:, :size]
+
+    def _list_postures(self, phase: int, start: Floats, goal: Floats) -> Floats:
+        """Return postures that are likely to be needed between two of them, shape (A, m - 3)."""
+        folded = self.routes.get_folded_arm(phase)
+        nearest = self.routes.find_nearest_folded_arm(phase, start, goal)
+        return np.array([start, goal, self.problem.chain.robot.home, folded, nearest])
 
     def _list_ends(self, phase: int, last: Floats, arms: Floats) -> Floats:
         """Return configurations like `last` with other postures, within the limits of the goal."""

@@ -1,8 +1,8 @@
 """Finds paths of base and arm around obstacles in open phases with two random trees.
 
-RRT-Connect (Kuffner and LaValle, ICRA 2000) in all coordinates of the robot. Half of the samples
-are near a guide path of the base, with arm postures that are likely to be needed there, so that
-narrow passages are found quickly; the others are uniform, so that every path is found in the end.
+RRT-Connect (Kuffner and LaValle, ICRA 2000) in all coordinates of the robot. Samples are uniform,
+so that every path is found in the end. Where the base drives, half of them are near a guide path of
+it, with arm postures that are likely to be needed there: narrow passages are found quickly.
 Three choices decide how soon an arm finds its way out of a shelf or a cage:
 
 - A tree grows by whole pieces of at most `_PIECE`, never by a part of one that ends at an obstacle.
@@ -29,7 +29,7 @@ from vkc_pin.utils.arrays import Bools, Floats, Ints
 
 __all__ = ["Guide", "OpenSearch"]
 
-_PIECE = 1.0  # longest edge of a tree, in the metric of searches: [rad] of a joint
+_PIECE = 0.5  # longest edge of a tree, in the metric of searches: [rad] of a joint
 _CHECK_STEP, _FINE_STEP = 0.05, 0.01  # between collision checks while trees grow, and of the result
 _SAMPLES = 32  # towards which a tree grows at once
 # largest standard deviation of guided samples from guide path and likely postures
@@ -114,7 +114,8 @@ class OpenSearch:
         first: Start configuration, shape (n,); coordinates outside the robot stay constant.
         ends: Possible end configurations, shape (E, n). If all of them lack more than `allowed`,
             the least violating one is used unless it is deep in collision.
-        guide: Where samples are likely to be needed.
+        guide: Where samples are likely to be needed; None, as for an arm on a fixed base: nowhere
+            in particular.
         allowed: Clearance that configurations may lack [m].
     """
 
@@ -124,7 +125,7 @@ class OpenSearch:
         phase: int,
         first: Floats,
         ends: Floats,
-        guide: Guide,
+        guide: Guide | None,
         *,
         allowed: float,
     ) -> None:
@@ -207,9 +208,11 @@ class OpenSearch:
             tips = tips[tips >= before]
 
     def _sample(self) -> Floats:
-        """Sample configurations, shape (_SAMPLES, m): half of them near the guide."""
-        half = _SAMPLES // 2
+        """Sample configurations, shape (_SAMPLES, m): with a guide, half of them near it."""
         z = self.rng.uniform(self.lowest, self.highest, (_SAMPLES, self.size))
+        if self.guide is None:
+            return z
+        half, quarter = _SAMPLES // 2, _SAMPLES // 4
         near = z[:half]
         near[:, :3] = self.rng.choice(self.guide.poses, half)
         near[:, 3:] = self.rng.choice(self.guide.arms, half)
@@ -218,7 +221,6 @@ class OpenSearch:
         deviation = np.repeat([_BASE_SPREAD, _ARM_SPREAD], [3, self.size - 3])
         near += spread * deviation * self.rng.normal(size=near.shape)
         # A quarter of all have any posture on the guide path.
-        quarter = _SAMPLES // 4
         z[half : half + quarter, :3] = self.rng.choice(self.guide.poses, quarter)
         return np.clip(z, self.lower, self.upper)
 
@@ -232,7 +234,7 @@ class OpenSearch:
         pieces = np.maximum(np.ceil(gaps / _PIECE).astype(int), 1)
         starts, tips = tree.z[nearest], nearest.copy()
         free = self._count_free_pieces(starts, goals, pieces)
-        for k in np.flatnonzero(free):
+        for k in np.flatnonzero((free > 0) & (gaps > 0.0)):
             share = np.arange(1, free[k] + 1)[:, None] / pieces[k]
             tips[k] = tree.add_branch(int(nearest[k]), starts[k] + share * (goals[k] - starts[k]))
         return tips, free == pieces

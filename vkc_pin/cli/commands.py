@@ -336,12 +336,8 @@ def _add_plan(commands: Any) -> None:
         add_option(plan, form, text)
     methods = "auto, interpolated, astar, rrt or stationary"
     add_option(plan, "--initialization METHOD", methods, default="auto")
-    add_option(
-        plan,
-        "--time-limit SECONDS",
-        "return the best motion found by then; default 60, or none with --max-evaluations",
-        type=float,
-    )
+    about = "return the best motion found by then; default 60, or none with --max-evaluations"
+    add_option(plan, "--time-limit SECONDS", about, type=float)
     about = "return the best motion found with this number of evaluations"
     add_option(plan, "--max-evaluations COUNT", about, type=int)
     add_seed(plan)

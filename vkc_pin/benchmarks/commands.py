@@ -35,6 +35,7 @@ def add_bench(commands: Any) -> None:
     _add_door(benches)
     _add_comparisons(benches)
     _add_scenes(benches)
+    _add_arms(benches)
     _add_matrix(benches)
     _add_problems(benches)
 
@@ -134,6 +135,20 @@ def _add_scenes(benches: Any) -> None:
     parser.add_argument("--recipe", metavar="RECIPE", help=about)
     about = "do not repeat the episodes with one and two workers"
     parser.add_argument("--no-curve", dest="curve", action="store_false", help=about)
+
+
+def _add_arms(benches: Any) -> None:
+    about = "plan for an arm on MoveIt's problems, beside roboplan and OMPL (extra `peers`)"
+    parser = _add_experiment(benches, "arms", about)
+    about = "folder with files scene0001.yaml and request0001.yaml"
+    parser.add_argument("problems", metavar="FOLDER", help=about)
+    parser.add_argument("--robot", required=True, metavar="ROBOT", help="name or robot.yaml file")
+    _add_choice(parser, "methods", "VKC roboplan OMPL (default: all)")
+    _add_choice(parser, "bases", "fixed omni (default: fixed)")
+    _add_choice(parser, "goals", "joints pose (default: joints)")
+    _add_count(parser, "--every", 1, "only every so many problems", metavar="K")
+    about = "wall-clock limit of a trial (default 60)"
+    parser.add_argument("--time-limit", type=float, default=60.0, metavar="SECONDS", help=about)
 
 
 def _add_matrix(benches: Any) -> None:

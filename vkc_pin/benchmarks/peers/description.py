@@ -87,9 +87,10 @@ def describe(problem: TrajectoryProblem, folder: Path, *, by_body: bool = False)
             parent, placement, at = child, pin.SE3.Identity(), at + 1
     if at != len(names):
         raise InputError("joints move together", field=", ".join(names))
-    goal = problem.pose_goals[0].row
-    ET.SubElement(root, "link", name=FRAME)
-    _joint(root, f"to_{FRAME}", "fixed", f"body_{goal.joint}", FRAME, goal.local)
+    if problem.pose_goals:
+        goal = problem.pose_goals[0].row
+        ET.SubElement(root, "link", name=FRAME)
+        _joint(root, f"to_{FRAME}", "fixed", f"body_{goal.joint}", FRAME, goal.local)
     margins = dict(zip(map(tuple, part.pairs.tolist()), part.margins.tolist(), strict=True))
     least: dict[frozenset[int], float] = {}  # of each pair of bodies
     for (i, j), margin in margins.items():

@@ -20,6 +20,7 @@ from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.procedural.rooms.random_room import sample_layout
 from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.utils.cache import Cache
+from vkc_pin.world.scene.clearance_exemptions import ACCEPTED_SHORTFALL
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Actuate, Grasp, Reach, Step
@@ -112,6 +113,9 @@ def build_program(
 
 def sample_goals(problem: TrajectoryProblem, rng: np.random.Generator, most: int) -> Floats:
     """Sample goal configurations that keep their margins, nearest to the start first, (K, n)."""
+    if not problem.pose_goals:  # the goal is a configuration
+        goal = np.clip(problem.start, problem.lower[-1], problem.upper[-1])[None]
+        return goal[compute_shortfall(problem, goal, problem.segments) <= ACCEPTED_SHORTFALL]
     found = _free(problem, rng)
     if not len(found):
         return found

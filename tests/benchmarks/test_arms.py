@@ -1,0 +1,76 @@
+"""Tests the experiment with arms in clutter."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.moveit_problems import ROBOT, make_request, make_scene, write
+
+from vkc_pin.benchmarks import arms
+from vkc_pin.benchmarks.harness.record import describe_environment
+
+
+def make_record(method: str, length: float, **changes: Any) -> dict[str, Any]:
+    same = {"problem": "box/0001", "base": "fixed", "goal": "joints", "status": "success"}
+    times = {"time_final": 1.0, "time_own": 0.5, "duration": 4.0, "joint_length": length}
+    usual = {"valid": True, "success": True, "violations": []}
+    return {**same, **times, **usual, "method": method, **changes}
+
+
+def test_problem_is_planned_to_joint_values_and_to_the_pose_there(tmp_path: Path) -> None:
+    write(tmp_path, make_scene(), make_request())
+    found = arms.run(
+        out=tmp_path / "out",
+        problems=str(tmp_path),
+        robot=ROBOT,
+        methods=["VKC"],
+        bases=["fixed", "omni"],
+        goals=["joints", "pose"],
+        progress=False,
+    )
+    records = found["trials"]
+    assert [r["key"] for r in records] == [
+        f"0001/{base}/{goal}/VKC" for base in ("fixed", "omni") for goal in ("joints", "pose")
+    ]
+    for record in records:
+        assert record["valid"]
+        assert record["success"]
+        assert record["least_margin"] >= -1e-3
+        assert record["joint_length"] > 0.1
+    assert "1 of 1" in (tmp_path / "out" / "table.md").read_text(encoding="utf-8")
+
+
+def test_table_compares_lengths_and_leaves_out_what_is_invalid() -> None:
+    records = [
+        make_record("VKC", 3.0),
+        make_record("roboplan", 4.0),
+        make_record("OMPL", 5.0),
+        make_record("VKC", 1.0, problem="box/0002", valid=False, success=False),
+        make_record("OMPL", 1.0, problem="box/0003", success=False, status="timed out"),
+    ]
+    meta = describe_environment(
+        problems=3,
+        robot="fetch",
+        seed=0,
+        methods=list(arms.METHODS),
+        bases=["fixed"],
+        goals=["joints"],
+        time_limit=60.0,
+        clearance=0.002,
+        peers={"ompl": "2"},
+    )
+    table = arms.format_results({"meta": meta, "trials": records})
+    assert "the others, 1 problems: median 0.75, largest 0.75" in table
+    assert "not counted: box/0002." in table
+    assert "- box/0003, fixed, joints, OMPL: timed out" in table
+    assert "box/0002, fixed" not in table
+
+
+@pytest.mark.parametrize(("name", "value"), [("methods", ["RRT"]), ("bases", ["wheels"])])
+def test_unknown_choices_are_named(name: str, value: list[str], tmp_path: Path) -> None:
+    write(tmp_path, make_scene(), make_request())
+    more: dict[str, Any] = {name: value}
+    with pytest.raises(Exception, match=value[0]):
+        arms.run(out=tmp_path / "out", problems=str(tmp_path), robot=ROBOT, **more)

@@ -1,0 +1,191 @@
+"""Reads planning problems of MoveIt: a scene of boxes, cylinders and spheres, and a request.
+
+These are the messages moveit_msgs/PlanningScene and MotionPlanRequest as YAML files, as
+MotionBenchMaker (Chamzas et al., RA-L 2022) writes them: `scene0001.yaml` and `request0001.yaml`.
+Objects are in the frame of the robot's root. The goal is one value for each of some joints.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import pydantic
+
+from vkc_pin.errors import InputError
+from vkc_pin.world.files.documents import parse_document, read_yaml
+from vkc_pin.world.scene.scene import Scene
+
+__all__ = ["Problem", "list_problems", "read_problem"]
+
+_FIELDS = {"box": 3, "cylinder": 2, "sphere": 1}
+"""Type of a primitive → number of its dimensions [m]."""
+_ARENA = 10.0  # [m] half the edge of the square that a driving base may use
+_REQUEST = re.compile(r"request(\w+)\.yaml")
+
+
+class _Part(pydantic.BaseModel):
+    """A part of a message; its other fields are not used."""
+
+    model_config = pydantic.ConfigDict(extra="ignore", allow_inf_nan=False)
+
+
+class _Primitive(_Part):
+    type: Literal["box", "cylinder", "sphere"]
+    dimensions: tuple[float, ...]
+
+
+class _Pose(_Part):
+    position: tuple[float, float, float]
+    orientation: tuple[float, float, float, float]  # x, y, z, w
+
+
+class _Object(_Part):
+    id: str
+    primitives: tuple[_Primitive, ...] = ()
+    primitive_poses: tuple[_Pose, ...] = ()
+    meshes: tuple[Any, ...] = ()
+    planes: tuple[Any, ...] = ()
+
+
+class _World(_Part):
+    collision_objects: tuple[_Object, ...] = ()
+
+
+class _Scene(_Part):
+    world: _World = _World()
+
+
+class _Joints(_Part):
+    name: tuple[str, ...] = ()
+    position: tuple[float, ...] = ()
+
+
+class _State(_Part):
+    joint_state: _Joints = _Joints()
+
+
+class _JointGoal(_Part):
+    joint_name: str
+    position: float
+
+
+class _Goal(_Part):
+    joint_constraints: tuple[_JointGoal, ...] = ()
+    position_constraints: tuple[Any, ...] = ()
+    orientation_constraints: tuple[Any, ...] = ()
+
+
+class _Request(_Part):
+    start_state: _State = _State()
+    goal_constraints: tuple[_Goal, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A scene at its start, and the goal: joint → value [rad] or [m]."""
+
+    scene: Scene
+    goal: Mapping[str, float]
+
+
+def list_problems(folder: str | Path) -> dict[str, tuple[Path, Path]]:
+    """Return name → scene and request file of each problem in a folder and its folders.
+
+    Raises:
+        InputError: There are none, or a request has no scene beside it.
+    """
+    found = {}
+    for request in sorted(Path(folder).rglob("request*.yaml")):
+        match = _REQUEST.fullmatch(request.name)
+        if match is None:
+            continue
+        scene = request.with_name(f"scene{match[1]}.yaml")
+        if not scene.is_file():
+            raise InputError(
+                "there is no scene for this request", file=request, expected=scene.name
+            )
+        name = request.relative_to(folder).with_name(match[1]).as_posix()
+        found[name] = scene, request
+    if not found:
+        expected = "files scene0001.yaml and request0001.yaml"
+        raise InputError("there are no problems in this folder", file=folder, expected=expected)
+    return found
+
+
+def read_problem(
+    scene: str | Path, request: str | Path, robot: str | Path, *, base: str = "fixed"
+) -> Problem:
+    """Return a problem for a robot.
+
+    Args:
+        scene: File of the planning scene.
+        request: File of the request.
+        robot: Name or robot.yaml file of the robot; its root is the frame of the scene's objects.
+        base: Kind of its base: "fixed" or, with nothing on the floor, "omni".
+
+    Raises:
+        InputError: A file cannot be read, or has meshes, planes or a goal other than joint values.
+    """
+    world = parse_document(read_yaml(scene), _Scene).world
+    asked = parse_document(read_yaml(request), _Request)
+    obstacles = [entry for each in world.collision_objects for entry in _convert(each, scene)]
+    document = {
+        "name": f"{Path(scene).parent.name}_{Path(scene).stem}",
+        "robot": {"name": str(robot), "base": base},
+        "floor": False,
+        "start": {"base": [0.0, 0.0, 0.0]},
+        "arena": {"x": [-_ARENA, _ARENA], "y": [-_ARENA, _ARENA]},
+        "obstacles": obstacles,
+    }
+    placed = Scene.from_document(document, ".")
+    state = asked.start_state.joint_state
+    values = dict(zip(state.name, state.position, strict=False))
+    arm = placed.robot.coordinates.names[3:]
+    start = placed.with_start(arm={name: values[name] for name in arm if name in values})
+    return Problem(start, _read_goal(asked, Path(request)))
+
+
+def _convert(each: _Object, file: str | Path) -> list[dict[str, Any]]:
+    """Return an object of a planning scene as obstacles of a scene file."""
+    field = f"world.collision_objects: {each.id}"
+    if each.meshes or each.planes:
+        expected = "boxes, cylinders and spheres"
+        raise InputError("shapes are not supported", file=file, field=field, expected=expected)
+    if len(each.primitives) != len(each.primitive_poses):
+        expected, got = f"{len(each.primitives)} poses", len(each.primitive_poses)
+        raise InputError("wrong number", file=file, field=field, expected=expected, got=got)
+    found = []
+    for number, (shape, pose) in enumerate(zip(each.primitives, each.primitive_poses, strict=True)):
+        if len(shape.dimensions) != _FIELDS[shape.type]:
+            expected, got = f"{_FIELDS[shape.type]} dimensions", len(shape.dimensions)
+            raise InputError("wrong number", file=file, field=field, expected=expected, got=got)
+        entry: dict[str, Any] = {
+            "name": each.id if number == 0 else f"{each.id}_{number}",
+            "type": shape.type,
+            "position": list(pose.position),
+            "quaternion": list(pose.orientation),
+        }
+        if shape.type == "box":
+            entry["size"] = list(shape.dimensions)
+        elif shape.type == "cylinder":  # shape_msgs/SolidPrimitive: height first
+            entry["length"], entry["radius"] = shape.dimensions
+        else:
+            (entry["radius"],) = shape.dimensions
+        found.append(entry)
+    return found
+
+
+def _read_goal(request: _Request, file: Path) -> dict[str, float]:
+    """Return the first goal of a request."""
+    goal = next(iter(request.goal_constraints), None)
+    is_joints = goal is not None and goal.joint_constraints
+    if goal is None or not is_joints or goal.position_constraints or goal.orientation_constraints:
+        expected = "joint_constraints alone"
+        raise InputError(
+            "no goal in joint space", file=file, field="goal_constraints", expected=expected
+        )
+    return {each.joint_name: each.position for each in goal.joint_constraints}

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from helpers.moveit_problems import GOAL, JOINTS, POSE, ROBOT, make_request, make_scene, write
 
@@ -30,6 +31,19 @@ def test_scene_start_and_goal_are_read(tmp_path: Path) -> None:
     assert [each["name"] for each in (box, cylinder, ball)] == ["shelf", "shelf_1", "shelf_2"]
     assert (box["size"], box["quaternion"]) == ([0.1, 0.2, 0.3], POSE["orientation"])
     assert (cylinder["length"], cylinder["radius"], ball["radius"]) == (0.5, 0.04, 0.06)
+
+
+def test_objects_are_in_the_frame_of_a_link(tmp_path: Path) -> None:
+    scene = make_scene()
+    scene["world"]["collision_objects"][0]["header"] = {"frame_id": "wrist_3_link"}
+    problem = read_problem(*write(tmp_path, scene, make_request()), ROBOT)
+    model, start = problem.scene.robot.model, problem.scene.start
+    data, q = model.createData(), problem.scene.robot.coordinates.q(start[None])[0]
+    pin.framesForwardKinematics(model, data, q)
+    wrist = data.oMf[model.getFrameId("wrist_3_link")]
+    expected = wrist.act(np.array(POSE["position"]))
+    box = problem.scene.document["obstacles"][0]
+    np.testing.assert_allclose(box["position"], expected, atol=1e-9)
 
 
 def test_problem_can_be_planned(tmp_path: Path) -> None:
@@ -58,6 +72,10 @@ def add_mesh(scene: dict[str, Any], request: dict[str, Any]) -> None:
     scene["world"]["collision_objects"][0]["meshes"] = [{"vertices": []}]
 
 
+def name_a_frame(scene: dict[str, Any], request: dict[str, Any]) -> None:
+    scene["world"]["collision_objects"][0]["header"] = {"frame_id": "base_lnk"}
+
+
 def ask_for_a_pose(scene: dict[str, Any], request: dict[str, Any]) -> None:
     request["goal_constraints"] = [{"position_constraints": [{}]}]
 
@@ -69,6 +87,7 @@ def ask_for_a_pose(scene: dict[str, Any], request: dict[str, Any]) -> None:
         (break_sizes, ["scene0001.yaml", "shelf", "2 dimensions", "1"]),
         (break_poses, ["scene0001.yaml", "shelf", "3 poses", "2"]),
         (add_mesh, ["scene0001.yaml", "shelf", "boxes, cylinders and spheres"]),
+        (name_a_frame, ["scene0001.yaml", "shelf", "base_lnk", "did you mean 'base_link'"]),
         (ask_for_a_pose, ["request0001.yaml", "goal_constraints", "joint_constraints"]),
     ],
 )

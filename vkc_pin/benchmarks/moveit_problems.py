@@ -2,7 +2,8 @@
 
 These are the messages moveit_msgs/PlanningScene and MotionPlanRequest as YAML files, as
 MotionBenchMaker (Chamzas et al., RA-L 2022) writes them: `scene0001.yaml` and `request0001.yaml`.
-Objects are in the frame of the robot's root. The goal is one value for each of some joints.
+Objects are in the frame of the world or of a link of the robot. The goal is one value for each of
+some joints.
 """
 
 from __future__ import annotations
@@ -13,9 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+import pinocchio as pin
 import pydantic
 
-from vkc_pin.errors import InputError
+from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.files.documents import parse_document, read_yaml
 from vkc_pin.world.scene.scene import Scene
 
@@ -43,8 +46,13 @@ class _Pose(_Part):
     orientation: tuple[float, float, float, float]  # x, y, z, w
 
 
+class _Header(_Part):
+    frame_id: str = ""
+
+
 class _Object(_Part):
     id: str
+    header: _Header = _Header()
     primitives: tuple[_Primitive, ...] = ()
     primitive_poses: tuple[_Pose, ...] = ()
     meshes: tuple[Any, ...] = ()
@@ -124,7 +132,7 @@ def read_problem(
     Args:
         scene: File of the planning scene.
         request: File of the request.
-        robot: Name or robot.yaml file of the robot; its root is the frame of the scene's objects.
+        robot: Name or robot.yaml file of the robot.
         base: Kind of its base: "fixed" or, with nothing on the floor, "omni".
 
     Raises:
@@ -132,24 +140,42 @@ def read_problem(
     """
     world = parse_document(read_yaml(scene), _Scene).world
     asked = parse_document(read_yaml(request), _Request)
-    obstacles = [entry for each in world.collision_objects for entry in _convert(each, scene)]
     document = {
         "name": f"{Path(scene).parent.name}_{Path(scene).stem}",
         "robot": {"name": str(robot), "base": base},
         "floor": False,
         "start": {"base": [0.0, 0.0, 0.0]},
         "arena": {"x": [-_ARENA, _ARENA], "y": [-_ARENA, _ARENA]},
-        "obstacles": obstacles,
     }
-    placed = Scene.from_document(document, ".")
+    empty = Scene.from_document(document, ".")
     state = asked.start_state.joint_state
     values = dict(zip(state.name, state.position, strict=False))
-    arm = placed.robot.coordinates.names[3:]
-    start = placed.with_start(arm={name: values[name] for name in arm if name in values})
-    return Problem(start, _read_goal(asked, Path(request)))
+    arm = empty.robot.coordinates.names[3:]
+    start = {name: values[name] for name in arm if name in values}
+    standing = empty.with_start(arm=start)
+    obstacles = [
+        entry
+        for each in world.collision_objects
+        for entry in _convert(each, _find_frame(standing, each, scene), scene)
+    ]
+    placed = Scene.from_document({**document, "obstacles": obstacles}, ".").with_start(arm=start)
+    return Problem(placed, _read_goal(asked, Path(request)))
 
 
-def _convert(each: _Object, file: str | Path) -> list[dict[str, Any]]:
+def _find_frame(scene: Scene, each: _Object, file: str | Path) -> pin.SE3:
+    """Return the placement of the frame of an object in the world."""
+    name, model = each.header.frame_id, scene.robot.model
+    if name in ("", "world", "map"):
+        return pin.SE3.Identity()
+    names = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
+    if name not in names:
+        raise UnknownNameError("frame", name, names, file=file, field=each.id)
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, scene.robot.coordinates.q(scene.start[None])[0])
+    return data.oMf[model.getFrameId(name, pin.FrameType.BODY)]
+
+
+def _convert(each: _Object, frame: pin.SE3, file: str | Path) -> list[dict[str, Any]]:
     """Return an object of a planning scene as obstacles of a scene file."""
     field = f"world.collision_objects: {each.id}"
     if each.meshes or each.planes:
@@ -163,11 +189,13 @@ def _convert(each: _Object, file: str | Path) -> list[dict[str, Any]]:
         if len(shape.dimensions) != _FIELDS[shape.type]:
             expected, got = f"{_FIELDS[shape.type]} dimensions", len(shape.dimensions)
             raise InputError("wrong number", file=file, field=field, expected=expected, got=got)
+        x, y, z, w = pose.orientation
+        place = pin.SE3(pin.Quaternion(w, x, y, z).normalized(), np.array(pose.position))
         entry: dict[str, Any] = {
             "name": each.id if number == 0 else f"{each.id}_{number}",
             "type": shape.type,
-            "position": list(pose.position),
-            "quaternion": list(pose.orientation),
+            "position": (frame * place).translation.tolist(),
+            "quaternion": pin.Quaternion((frame * place).rotation).coeffs().tolist(),
         }
         if shape.type == "box":
             entry["size"] = list(shape.dimensions)

@@ -76,6 +76,8 @@ class RrtPaths:
         self.sampler, self.problem, self.routes = sampler, sampler.problem, routes
         self.effort = effort  # factor of the collision checks
         self._failures: Counter[int] = Counter()  # consecutive ones per phase
+        # Configurations at which the motion may end, shape (E, n).
+        self.final_ends = np.empty((0, self.problem.chain.size))
         # What the last search for an open path, if it failed, found between start and goal.
         self.obstruction: tuple[str, str] | None = None
 
@@ -96,7 +98,12 @@ class RrtPaths:
             else:
                 poses[:, 2] -= turned  # the trees find where the base can turn
             guide = Guide(poses, arms)
-        ends = last[None] if reaches else self._list_ends(phase, last, arms)
+        if not reaches:
+            ends = self._list_ends(phase, last, arms)
+        elif guide is None and phase + 1 == len(problem.ends):
+            ends = self._list_final_ends(last)
+        else:
+            ends = last[None]
         number = self._failures[phase]
         allowed = 0.0 if number % 2 else problem.options.dist_safe
         search = OpenSearch(self.sampler, phase, first, ends, guide, allowed=allowed)
@@ -118,6 +125,13 @@ class RrtPaths:
         ends[:, 3 : self.sampler.robot_size] = arms
         ends = np.clip(ends, self.problem.lower[end], self.problem.upper[end])
         return np.unique(ends, axis=0)
+
+    def _list_final_ends(self, last: Floats) -> Floats:
+        """Return the final ends that differ from `last`, one of them, in the robot alone."""
+        size, ends = self.sampler.robot_size, self.final_ends
+        if not (ends == last).all(axis=1).any():
+            return last[None]
+        return np.asarray(ends[(ends[:, size:] == last[size:]).all(axis=1)])
 
     def find_closed_path(self, phase: int, through: Floats, straight: Floats) -> Floats | None:
         """Find waypoints of a closed phase around obstacles; None if straight lines are free."""

@@ -30,6 +30,7 @@ __all__ = [
 SIMILARITY_TOLERANCE = 0.1  # [m], [rad] within which configurations are treated as the same
 SAMPLE_COUNT = 192  # random start configurations of inverse kinematics per keyframe
 _PUSHING_STEPS = 10  # maximum number of steps out of collision
+_SCATTER = (0.1, 2.0)  # standard deviations of scattered configurations, [m] and [rad]
 _DAMPING = 3e-4  # added to the diagonal of their normal equations
 _RowCache = dict[tuple[int, bytes], Floats]  # by waypoint and configuration
 
@@ -152,6 +153,8 @@ class KeyframeSampler:
         lower, upper = self.compute_limits(before, waypoint)
         pose = self.find_pose(waypoint)
         if pose is None:
+            if how == "scatter" and self._is_blocked(np.clip(z, lower, upper), waypoint):
+                z[1:] = self._scatter_robots(z[1:])
             return np.clip(z, lower, upper), np.ones(len(z), bool)
         # Random grasps; half of the arms near home, the others near the preceding configuration.
         if how == "scatter":
@@ -162,13 +165,23 @@ class KeyframeSampler:
                 z[:, column] = self.rng.uniform(low, high, len(z))
             z[::2, 3 : self.robot_size] = self.chain.robot.home
         if how != "track":
-            z = self._perturb_arms(z, pose, (0.1, 2.0) if how == "scatter" else (0.05, 0.5))
+            z = self._perturb_arms(z, pose, _SCATTER if how == "scatter" else (0.05, 0.5))
         z, found = self.solve_pose(z, pose, lower, upper)
         if how == "scatter":
             z = self._unwrap_angles(z, before, lower, upper)
         elif self.curves is not None and self.is_closed_at(waypoint):
             z, found = self._fit_base_to_arc(z, before, waypoint, pose)
         return z, found
+
+    def _is_blocked(self, z: Floats, waypoint: int) -> bool:
+        """Return whether all of some configurations, shape (B, n), are in collision."""
+        return bool(self.compute_shortfall(np.unique(z, axis=0), waypoint).min() > 0.0)
+
+    def _scatter_robots(self, z: Floats) -> Floats:
+        """Perturb all coordinates of robots, by up to a few metres and radians, shape (B, n)."""
+        spread, z = self.rng.uniform(*_SCATTER, (len(z), 1)), z.copy()
+        z[:, : self.robot_size] += spread * self.rng.normal(size=(len(z), self.robot_size))
+        return z
 
     def _fit_base_to_arc(
         self, z: Floats, before: Floats, waypoint: int, pose: int

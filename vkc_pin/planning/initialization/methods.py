@@ -79,7 +79,8 @@ def initialize(
         routes, cache = BaseRoutes(problem), KeyframeCache()
         shared = _Shared(problem, random_seed, notes, routes, cache, effort)
         if method == "auto":
-            kinds = ("interpolated", "astar", "rrt")
+            is_fixed = problem.chain.robot.base == "fixed"  # "astar" would equal "interpolated"
+            kinds = ("interpolated", "rrt") if is_fixed else ("interpolated", "astar", "rrt")
             guesses = interleave_guesses(
                 *(_generate_guesses(kind, shared, count, is_infeasible) for kind in kinds)
             )
@@ -238,6 +239,9 @@ class _GuessSearch:
             found = min(found, other, key=lambda one: float(one.cost.min()))
         return found
 
+    def _interpolate(self, path: Floats, found: SearchResult) -> Floats | None:
+        return self.interpolator.interpolate(path, found.waypoints)
+
     def _is_same(self, path: Floats, other: Floats) -> bool:
         """Return whether two paths lead to the same guess."""
         return bool(np.abs(path - other).max() <= SIMILARITY_TOLERANCE)
@@ -265,7 +269,7 @@ class _GuessSearch:
             if any(self._is_same(path, other) for other in [*used, *compared]):
                 continue
             compared.append(path)
-            z = self.interpolator.interpolate(path, found.waypoints)
+            z = self._interpolate(path, found)
             self.notes += [line for line in self.interpolator.blocked if line not in self.notes]
             if z is None:
                 continue
@@ -292,11 +296,9 @@ class _RrtSearch(_GuessSearch):
         self.failed_directions = set[bool]()
         sampler = shared.make_sampler()
         beam = BeamSearch(sampler, shared.driving_routes, for_narrow_passages=True)
-        return beam, Interpolator(
-            sampler,
-            ApproachPaths(sampler, keeps_base_fixed=True),
-            RrtPaths(sampler, shared.routes, effort=shared.effort),
-        )
+        self.paths = RrtPaths(sampler, shared.routes, effort=shared.effort)
+        approach = ApproachPaths(sampler, keeps_base_fixed=True)
+        return beam, Interpolator(sampler, approach, self.paths)
 
     def _search(self, attempt: int) -> SearchResult | None:
         """Run a search, every second one backwards, avoiding a direction that alone failed last."""
@@ -309,6 +311,13 @@ class _RrtSearch(_GuessSearch):
             return found
         self.failed_directions.add(backwards)
         return None
+
+    def _interpolate(self, path: Floats, found: SearchResult) -> Floats | None:
+        """Interpolate along a path; an arm may end in other postures of the same goal."""
+        are_same = (found.paths[:, :-1] == path[:-1]).all(axis=(1, 2))
+        is_free = found.collision_cost <= 0.0
+        self.paths.final_ends = found.paths[are_same & is_free, -1]
+        return super()._interpolate(path, found)
 
     def _is_same(self, path: Floats, other: Floats) -> bool:
         return False  # trees lead another way each time

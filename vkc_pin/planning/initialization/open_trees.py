@@ -38,6 +38,9 @@ _SHORTCUTS = 100  # tried on a path; each is a line between two random points
 _STRAIGHTENING_ROUNDS = 3
 _PRODUCT_SIZE = 200_000  # multiplications in a product of matrices that needs no threads
 _FAR = 1e6  # scaled coordinates of nodes that are cut off
+# Searches for an arm go on for other ways until this multiple of the checks of the first, and find
+# at most so many paths; the shortest is taken
+_EFFORT, _PATHS = 2, 5
 _MIN_DETOUR = 1e-6  # [rad] by which a corner is further from its neighbours than on a line
 _MIN_SAVING = 1e-3  # relative saving in length that a shortcut needs
 
@@ -150,7 +153,7 @@ class OpenSearch:
         self.allowed = max(allowed, min(needed, 2.0 * self.problem.options.dist_safe))
         self.ends = self.ends[ending <= self.allowed]
         self.has_ends = needed <= self.allowed
-        self.trees = _Tree(self.start, self.weights), _Tree(self.ends, self.weights)
+        self._reset_trees()
 
     def _compute_shortfall(self, z: Floats) -> Floats:
         return compute_shortfall(self.problem, self._complete(z), self.waypoint)
@@ -164,8 +167,17 @@ class OpenSearch:
             steps: Number of waypoints.
             max_checks: Number of collision checks after which the search ends.
         """
-        path = self._connect(max_checks) if self.has_ends else None
-        return None if path is None else self._resample(self._shorten(path), steps)
+        first = self._connect(max_checks) if self.has_ends else None
+        if first is None:
+            return None
+        found, limit = [self._shorten(first)], _EFFORT * self.checks
+        while self.guide is None and len(found) < _PATHS and self.checks < limit:
+            self._reset_trees()
+            path = self._connect(limit)
+            if path is not None:
+                found.append(self._shorten(path))
+        shortest = min(found, key=lambda path: float(self._measure_along(path)[-1]))
+        return self._resample(shortest, steps)
 
     def find_obstruction(self) -> tuple[str, str] | None:
         """Return the names of what collides first between the places where the trees are nearest.
@@ -192,6 +204,9 @@ class OpenSearch:
         labels = self.problem.contacts.phases[self.phase].labels
         first, second = contacts.pair[wrong[0]]
         return labels[first], labels[second]
+
+    def _reset_trees(self) -> None:
+        self.trees = _Tree(self.start, self.weights), _Tree(self.ends, self.weights)
 
     def _connect(self, max_checks: int) -> Floats | None:
         """Find a path from the start to one of the ends, shape (P, m); None if there is none."""

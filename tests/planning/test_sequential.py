@@ -225,7 +225,8 @@ def test_attachments_share_the_budget(planner: Callable[..., vkc.Plan]) -> None:
     budget = {"max_evaluations": 30_000}
     alone = vkc.plan(scene, [dataclasses.replace(step, attachment="behind")], **budget)
     assert alone.status == "evaluation limit"
-    (note,) = alone.report.notes
+    note, ending = alone.report.notes
+    assert "limit of 30000 evaluations" in ending
     assert note.startswith("the best trajectory lacks ")
     assert alone.report.violations[0].subject in note
     result = planner(scene, [step], **budget)

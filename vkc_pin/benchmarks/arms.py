@@ -26,7 +26,7 @@ from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.scene.clearance_exemptions import ACCEPTED_SHORTFALL
+from vkc_pin.world.scene.clearance_exemptions import ACCEPTED_SHORTFALL, CONTACT_DEPTH
 from vkc_pin.world.task.steps import Configure, Reach, Step
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
@@ -130,9 +130,10 @@ def format_results(result: Mapping[str, Any]) -> str:
         "# Arms in clutter",
         f"{about['problems']} problems for {about['robot']}, seed {about['seed']}; clearance "
         f"{1e3 * about['clearance']:g} mm; at most {about['time_limit']:g} s each. Peers: "
-        f"{listed or 'none'}. {JUDGED} Motions also keep the clearance at 100 configurations a "
-        "second. Times are CPU time; those of the search alone are without building programs, "
-        "timing and validation. Lengths are medians of successes, Euclidean in joint space.",
+        f"{listed or 'none'}. {JUDGED} Nothing overlaps in 100 configurations a "
+        "second either. Times are CPU time; those of the search alone are without building "
+        "programs, timing and validation. Lengths are medians of successes, Euclidean in joint "
+        "space.",
         format_table(head, rows, text=3),
         *([_compare_lengths(records)] if len(about["methods"]) > 1 else []),
         f"Start or goal in collision, not counted: {', '.join(invalid) or 'none'}.",
@@ -190,7 +191,7 @@ def _record(spec: dict[str, Any], *, problems: str, robot: str) -> dict[str, Any
     record |= {"valid": is_valid, "time_final": took, "time_own": own_time}
     if found.success:
         record |= _measure(exact, found.trajectory)
-        record["success"] = record["least_margin"] >= -ACCEPTED_SHORTFALL
+        record["success"] = record["least_distance"] >= -CONTACT_DEPTH
     return record
 
 
@@ -219,7 +220,7 @@ def _plan_by_peer(
 
 
 def _measure(problem: TrajectoryProblem, trajectory: Trajectory) -> dict[str, Any]:
-    """Return duration [s], length in joint space [rad] and least margin [m] of a motion."""
+    """Return duration [s], length in joint space [rad] and least distance [m] of a motion."""
     times = np.arange(0.0, trajectory.times[-1] + _SAMPLING, _SAMPLING)
     z = trajectory.at(np.minimum(times, trajectory.times[-1]))
     contacts = problem.contacts.evaluate(z, np.ones(len(z), int), reach=_NEAR, nearest=1)
@@ -227,5 +228,5 @@ def _measure(problem: TrajectoryProblem, trajectory: Trajectory) -> dict[str, An
     return {
         "duration": float(trajectory.times[-1]),
         "joint_length": float(np.linalg.norm(steps, axis=1).sum()),
-        "least_margin": float((contacts.distance - contacts.margin).min(initial=_NEAR)),
+        "least_distance": float(contacts.distance.min(initial=_NEAR)),
     }

@@ -34,13 +34,13 @@ _CHECK_STEP, _FINE_STEP = 0.05, 0.01  # between collision checks while trees gro
 _SAMPLES = 32  # towards which a tree grows at once
 # largest standard deviation of guided samples from guide path and likely postures
 _BASE_SPREAD, _ARM_SPREAD = 0.1, 0.4  # [m] and [rad]
-_SHORTCUTS = 100  # tried on a path; each is a line between two random points
+_SHORTCUT_ROUNDS, _SHORTCUTS = 10, 20  # lines between random points of a path, tried at once
 _STRAIGHTENING_ROUNDS = 3
 _PRODUCT_SIZE = 200_000  # multiplications in a product of matrices that needs no threads
 _FAR = 1e6  # scaled coordinates of nodes that are cut off
 # Searches for an arm go on for other ways until this multiple of the checks of the first, and find
 # at most so many paths; the shortest is taken
-_EFFORT, _PATHS = 2, 5
+_EFFORT, _PATHS = 8, 12
 _MIN_DETOUR = 1e-6  # [rad] by which a corner is further from its neighbours than on a line
 _MIN_SAVING = 1e-3  # relative saving in length that a shortcut needs
 
@@ -170,14 +170,18 @@ class OpenSearch:
         first = self._connect(max_checks) if self.has_ends else None
         if first is None:
             return None
-        found, limit = [self._shorten(first)], _EFFORT * self.checks
-        while self.guide is None and len(found) < _PATHS and self.checks < limit:
+        ways, limit = [first], _EFFORT * self.checks
+        while self.guide is None and len(ways) < _PATHS and self.checks < limit:
             self._reset_trees()
-            path = self._connect(limit)
-            if path is not None:
-                found.append(self._shorten(path))
-        shortest = min(found, key=lambda path: float(self._measure_along(path)[-1]))
-        return self._resample(shortest, steps)
+            other = self._connect(limit)
+            if other is not None:
+                ways.append(other)
+        shorter = [self._cut_corners(way, _CHECK_STEP) for way in ways]
+        best = int(np.argmin([self._measure_along(path)[-1] for path in shorter]))
+        path = self._straighten(shorter[best], _CHECK_STEP)
+        if not self._are_lines_free(path[:-1], path[1:], _FINE_STEP).all():
+            path = self._straighten(self._cut_corners(ways[best], _FINE_STEP), _FINE_STEP)
+        return self._resample(path, steps)
 
     def find_obstruction(self) -> tuple[str, str] | None:
         """Return the names of what collides first between the places where the trees are nearest.
@@ -326,15 +330,35 @@ class OpenSearch:
         free = self._count_free(starts[lines] + share[:, None] * (ends - starts)[lines], edges)
         return np.asarray(free // steps)
 
-    def _shorten(self, path: Floats) -> Floats:
-        """Shortcut a path, shape (P, m), between random points on it, then joint by joint."""
-        for _ in range(_SHORTCUTS):
+    def _cut_corners(self, path: Floats, step: float) -> Floats:
+        """Replace pieces of a path, shape (P, m), between random points on it by straight lines.
+
+        Many are checked at once; of those that overlap, the one that saves most is used.
+        """
+        for _ in range(_SHORTCUT_ROUNDS):
             passed = self._measure_along(path)
-            first, last = np.sort(self.rng.uniform(0.0, passed[-1], 2))
-            path = self._replace(path, passed, first, last, range(self.size))
-        # A path through a narrow passage with another posture moves all joints. Straight lines in
-        # all coordinates seldom undo that, and the solver cannot, because obstacles are in between
-        # (partial shortcuts: Geraerts and Overmars, IJRR 2007).
+            at = np.sort(self.rng.uniform(0.0, passed[-1], (_SHORTCUTS, 2)), axis=1)
+            ends = _interpolate(at.ravel(), passed, path).reshape(_SHORTCUTS, 2, -1)
+            savings = at[:, 1] - at[:, 0] - self._measure(ends[:, 0], ends[:, 1])
+            useful = np.flatnonzero(savings > _MIN_SAVING * passed[-1])
+            free = self._are_lines_free(ends[useful, 0], ends[useful, 1], step)
+            used = list[int]()
+            for k in sorted(useful[free].tolist(), key=lambda k: -savings[k]):
+                if all(at[k, 0] > at[j, 1] or at[k, 1] < at[j, 0] for j in used):
+                    used.append(k)
+            for k in used:  # `passed` stays the length along the path before
+                before, after = passed < at[k, 0], passed > at[k, 1]
+                path = np.vstack([path[before], ends[k], path[after]])
+                passed = np.concatenate([passed[before], at[k], passed[after]])
+        return path
+
+    def _straighten(self, path: Floats, step: float) -> Floats:
+        """Move the arm, and each joint alone, evenly along a path where that is free.
+
+        A path through a narrow passage with another posture moves all joints. Straight lines in all
+        coordinates seldom undo that, and the solver cannot, because obstacles are in between
+        (partial shortcuts: Geraerts and Overmars, IJRR 2007).
+        """
         arm = range(3, self.size)
         for number in range(1 + _STRAIGHTENING_ROUNDS):
             for columns in (arm, *([column] for column in arm)):
@@ -342,7 +366,7 @@ class OpenSearch:
                 first, last = 0.0, float(passed[-1])
                 if number:
                     first, last = np.sort(self.rng.uniform(0.0, passed[-1], 2))
-                path = self._replace(path, passed, first, last, columns)
+                path = self._replace(path, passed, first, last, columns, step)
         return path
 
     def _measure_along(self, path: Floats) -> Floats:
@@ -350,7 +374,13 @@ class OpenSearch:
         return np.concatenate([[0.0], np.cumsum(self._measure(path[1:], path[:-1]))])
 
     def _replace(
-        self, path: Floats, passed: Floats, first: float, last: float, columns: Sequence[int]
+        self,
+        path: Floats,
+        passed: Floats,
+        first: float,
+        last: float,
+        columns: Sequence[int],
+        step: float,
     ) -> Floats:
         """Move some coordinates evenly between two points on a path, if it is free and shorter.
 
@@ -360,6 +390,7 @@ class OpenSearch:
             first: Length up to the first point.
             last: Length up to the last point.
             columns: The coordinates.
+            step: Distance between collision checks.
         """
         inside = (passed > first) & (passed < last)
         if not inside.any():
@@ -369,11 +400,9 @@ class OpenSearch:
         new = old.copy()
         share = ((at - first) / (last - first))[:, None]
         new[:, columns] = (old[0] + share * (old[-1] - old[0]))[:, columns]
-        if len(columns) == self.size:
-            new = new[[0, -1]]
         before, after = (self._measure(part[1:], part[:-1]).sum() for part in (old, new))
         is_shorter = after < (1.0 - _MIN_SAVING) * before
-        if not is_shorter or not self._are_lines_free(new[:-1], new[1:], _FINE_STEP).all():
+        if not is_shorter or not self._are_lines_free(new[:-1], new[1:], step).all():
             return path
         return np.vstack([path[passed < first], new, path[passed > last]])
 

@@ -40,7 +40,7 @@ _PRODUCT_SIZE = 200_000  # multiplications in a product of matrices that needs n
 _FAR = 1e6  # scaled coordinates of nodes that are cut off
 # Searches for an arm go on for other ways until this multiple of the checks of the first, and find
 # at most so many paths; the shortest is taken
-_EFFORT, _PATHS = 8, 12
+_EFFORT, _PATHS = 2, 5
 _MIN_DETOUR = 1e-6  # [rad] by which a corner is further from its neighbours than on a line
 _MIN_SAVING = 1e-3  # relative saving in length that a shortcut needs
 

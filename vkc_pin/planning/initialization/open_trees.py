@@ -313,6 +313,8 @@ class OpenSearch:
 
         Configurations far apart are checked first, since they are most likely to differ.
         """
+        if not len(starts):
+            return np.zeros(0, bool)
         counts = np.maximum(np.ceil(self._measure(starts, ends) / step).astype(int), 1)
         shares = [_order_shares(count) for count in counts.tolist()]
         lines, edges = np.repeat(np.arange(len(counts)), counts), np.cumsum([0, *counts])

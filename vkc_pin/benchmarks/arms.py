@@ -77,11 +77,13 @@ def run(
     methods = list(runner.select_names("method", methods, METHODS))
     bases = list(runner.select_names("base", bases, BASES))
     goals = list(runner.select_names("goal", goals, GOALS))
-    names = list(list_problems(problems))[::every]
+    files = list_problems(problems)
+    names = list(files)[::every]
+    name = read_problem(*files[names[0]], robot).scene.robot.name
     settings = {
         "benchmark": "arms",
         "problems": len(names),
-        "robot": Path(robot).stem,
+        "robot": name,
         "seed": seed,
         "methods": methods,
         "bases": bases,

@@ -203,6 +203,23 @@ def test_samples_along_the_guide_find_a_path_sooner() -> None:
     assert with_guide < 0.5 * without
 
 
+def test_obstruction_is_named() -> None:
+    """It is the wall between the nearest nodes, whatever was cut off from the trees."""
+    problem = make_gate_problem(0.0)
+    ends = np.array([problem.start, make_waypoint(problem, (4.0, 0.5, 0.0))])
+    guide = Guide(ends[:, :3], ends[:, 3:])
+    search = OpenSearch(make_sampler(problem), 0, ends[0], ends[1:], guide, allowed=0.0)
+    assert search.find_path(STEPS, 2000) is None
+    for tree in search.trees:
+        tree.cut(len(tree) - 1)
+    pair = search.find_obstruction()
+    assert pair is not None
+    assert {"left", "right"} & {*pair}
+    inside = make_waypoint(problem, (2.0, 1.5, 0.0))[None]
+    blocked = OpenSearch(make_sampler(problem), 0, ends[0], inside, guide, allowed=0.0)
+    assert blocked.find_obstruction() is None
+
+
 @settings(max_examples=20, deadline=None)
 @given(st.integers(1, 400))
 def test_lines_are_checked_everywhere_and_far_apart_first(count: int) -> None:

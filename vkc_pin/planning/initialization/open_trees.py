@@ -140,7 +140,7 @@ class OpenSearch:
         names = self.problem.chain.names[: self.size]
         limits = np.array([self.problem.limits(name) for name in names])
         self.lower, self.upper = limits.T
-        # Uniform samples turn a joint without limits by half a turn at most.
+        # Joints that can turn further than once around are sampled within half a turn of the middle.
         middle = (first + ends[0])[: self.size] / 2.0
         turns = np.array([self.problem.unit(name) == "rad" for name in names])
         is_endless = turns & (self.upper - self.lower > 2.0 * np.pi)
@@ -191,9 +191,10 @@ class OpenSearch:
         if not self.has_ends:
             return None
         one, other = self.trees
-        nearest, gaps = one.find_nearest(other.scaled / self.weights)
+        goals = other.z[np.isfinite(other.z).all(axis=1)]
+        nearest, gaps = one.find_nearest(goals)
         k = int(gaps.argmin())
-        start, end = one.z[nearest[k]], other.z[k]
+        start, end = one.z[nearest[k]], goals[k]
         count = max(int(np.ceil(gaps[k] / _FINE_STEP)), 1)
         line = self._complete(start + np.arange(1, count + 1)[:, None] / count * (end - start))
         contacts = self.problem.contacts.evaluate(

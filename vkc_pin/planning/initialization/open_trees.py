@@ -140,7 +140,7 @@ class OpenSearch:
         names = self.problem.chain.names[: self.size]
         limits = np.array([self.problem.limits(name) for name in names])
         self.lower, self.upper = limits.T
-        # Joints that can turn further than once around are sampled within half a turn of the middle.
+        # Joints that can turn more than once are sampled within half a turn of the middle.
         middle = (first + ends[0])[: self.size] / 2.0
         turns = np.array([self.problem.unit(name) == "rad" for name in names])
         is_endless = turns & (self.upper - self.lower > 2.0 * np.pi)

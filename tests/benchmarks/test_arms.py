@@ -23,7 +23,7 @@ def test_problem_is_planned_to_joint_values_and_to_the_pose_there(tmp_path: Path
     write(tmp_path, make_scene(), make_request())
     found = arms.run(
         out=tmp_path / "out",
-        problems=str(tmp_path),
+        folder=str(tmp_path),
         robot=ROBOT,
         methods=["VKC"],
         bases=["fixed", "omni"],
@@ -73,4 +73,4 @@ def test_unknown_choices_are_named(name: str, value: list[str], tmp_path: Path) 
     write(tmp_path, make_scene(), make_request())
     more: dict[str, Any] = {name: value}
     with pytest.raises(Exception, match=value[0]):
-        arms.run(out=tmp_path / "out", problems=str(tmp_path), robot=ROBOT, **more)
+        arms.run(out=tmp_path / "out", folder=str(tmp_path), robot=ROBOT, **more)

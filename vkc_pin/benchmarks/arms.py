@@ -47,7 +47,7 @@ _NEAR = 0.05  # [m] up to which distances are measured
 def run(
     *,
     out: str | Path,
-    problems: str,
+    folder: str,
     robot: str,
     seed: int = 0,
     methods: Sequence[str] = METHODS,
@@ -62,7 +62,7 @@ def run(
 
     Args:
         out: Folder.
-        problems: Folder with scene and request files; see `moveit_problems`.
+        folder: Folder with scene and request files; see `moveit_problems`.
         robot: Name or robot.yaml file of the robot.
         seed: Random seed of planning.
         methods: Some of `METHODS`.
@@ -77,7 +77,7 @@ def run(
     methods = list(runner.select_names("method", methods, METHODS))
     bases = list(runner.select_names("base", bases, BASES))
     goals = list(runner.select_names("goal", goals, GOALS))
-    files = list_problems(problems)
+    files = list_problems(folder)
     names = list(files)[::every]
     name = read_problem(*files[names[0]], robot).scene.robot.name
     settings = {
@@ -101,7 +101,7 @@ def run(
         for method in methods
         if method not in _PEERS or (base, goal) == ("fixed", "joints")
     ]
-    function = functools.partial(_record, problems=problems, robot=robot)
+    function = functools.partial(_record, folder=folder, robot=robot)
     return runner.run(
         specs, function, out, settings=settings, format_results=format_results, **execution
     )
@@ -169,8 +169,8 @@ def _compare_lengths(records: Sequence[Record]) -> str:
     )
 
 
-def _record(spec: dict[str, Any], *, problems: str, robot: str) -> dict[str, Any]:
-    scene, request = list_problems(problems)[spec["problem"]]
+def _record(spec: dict[str, Any], *, folder: str, robot: str) -> dict[str, Any]:
+    scene, request = list_problems(folder)[spec["problem"]]
     problem = read_problem(scene, request, robot, base=spec["base"])
     clearance = spec["clearance"]
     options = Options(dist_safe=clearance, self_distance=clearance)

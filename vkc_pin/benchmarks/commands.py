@@ -141,7 +141,7 @@ def _add_arms(benches: Any) -> None:
     about = "plan for an arm on MoveIt's problems, beside roboplan and OMPL (extra `peers`)"
     parser = _add_experiment(benches, "arms", about)
     about = "folder with files scene0001.yaml and request0001.yaml"
-    parser.add_argument("problems", metavar="FOLDER", help=about)
+    parser.add_argument("folder", metavar="FOLDER", help=about)
     parser.add_argument("--robot", required=True, metavar="ROBOT", help="name or robot.yaml file")
     _add_choice(parser, "methods", "VKC roboplan OMPL (default: all)")
     _add_choice(parser, "bases", "fixed omni (default: fixed)")

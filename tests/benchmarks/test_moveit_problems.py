@@ -76,6 +76,10 @@ def name_a_frame(scene: dict[str, Any], request: dict[str, Any]) -> None:
     scene["world"]["collision_objects"][0]["header"] = {"frame_id": "base_lnk"}
 
 
+def drop_a_position(scene: dict[str, Any], request: dict[str, Any]) -> None:
+    request["start_state"]["joint_state"]["position"].pop()
+
+
 def ask_for_a_pose(scene: dict[str, Any], request: dict[str, Any]) -> None:
     request["goal_constraints"] = [{"position_constraints": [{}]}]
 
@@ -88,6 +92,7 @@ def ask_for_a_pose(scene: dict[str, Any], request: dict[str, Any]) -> None:
         (break_poses, ["scene0001.yaml", "shelf", "3 poses", "2"]),
         (add_mesh, ["scene0001.yaml", "shelf", "boxes, cylinders and spheres"]),
         (name_a_frame, ["scene0001.yaml", "shelf", "base_lnk", "did you mean 'base_link'"]),
+        (drop_a_position, ["request0001.yaml", "joint_state", "4 positions", "3"]),
         (ask_for_a_pose, ["request0001.yaml", "goal_constraints", "joint_constraints"]),
     ],
 )

@@ -1,4 +1,4 @@
-"""Tests that searches go on until their limit, and that what they find is kept."""
+"""Tests that searches go on until their limit, and that their paths are kept."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SHORT = vkc.Options(reach_waypoints=30, max_restarts=1, dist_safe=0.01, self_dis
 
 
 def make_scene() -> tuple[vkc.Scene, vkc.Configure]:
-    """Return an arm on a fixed base with a pole in its way, and a goal behind it."""
+    """Return an arm on a fixed base before a pole, and a goal behind it."""
     hall = make_hall(base="fixed", obstacles=[{**POLE, "position": [0.37, 0.25, 1.7]}])
     names = hall.robot.coordinates.names[3:]
     return hall.with_start(arm=BEFORE), vkc.Configure(dict(zip(names, BEHIND, strict=True)))

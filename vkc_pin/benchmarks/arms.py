@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Callable, Mapping, Sequence
-from importlib.metadata import version
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -16,16 +15,13 @@ from vkc_pin.benchmarks.harness.record import Record, distribution, trial, value
 from vkc_pin.benchmarks.harness.runner import Execution
 from vkc_pin.benchmarks.harness.tables import JUDGED, count, format_table, join_sections, select
 from vkc_pin.benchmarks.moveit_problems import Problem, list_problems, read_problem
-from vkc_pin.benchmarks.peers.found import Clock, Peer, validate_path
-from vkc_pin.benchmarks.peers.projected import plan_by_projection
-from vkc_pin.benchmarks.peers.sampled import plan_by_sampling
+from vkc_pin.benchmarks.peers.found import Clock
+from vkc_pin.benchmarks.peers.run import PEERS, find_versions, plan_by_peer
 from vkc_pin.benchmarks.peers.tasks import PeerProblem, build_program
 from vkc_pin.options import Options
 from vkc_pin.planning.initialization.keyframes import compute_shortfall
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.scene.clearance_exemptions import ACCEPTED_SHORTFALL, CONTACT_DEPTH
 from vkc_pin.world.task.steps import Configure, Reach, Step
 from vkc_pin.world.trajectory.trajectory import Trajectory
@@ -35,10 +31,6 @@ __all__ = ["BASES", "GOALS", "METHODS", "format_results", "run"]
 METHODS = ("VKC", "roboplan", "OMPL")
 BASES = ("fixed", "omni")
 GOALS = ("joints", "pose")
-_PEERS: Mapping[str, tuple[Peer, str]] = {
-    "roboplan": (plan_by_projection, "roboplan"),
-    "OMPL": (plan_by_sampling, "ompl"),
-}
 _CLEARANCE = 0.002  # [m] goals of these sets are 5 mm from obstacles and more
 _SAMPLING = 0.01  # [s] between configurations that are judged
 _NEAR = 0.05  # [m] up to which distances are measured
@@ -90,7 +82,7 @@ def run(
         "goals": goals,
         "time_limit": time_limit,
         "clearance": clearance,
-        "peers": {_PEERS[name][1]: version(_PEERS[name][1]) for name in methods if name in _PEERS},
+        "peers": find_versions(methods),
     }
     specs = [
         {"key": f"{name}/{base}/{goal}/{method}", "problem": name, "base": base, "goal": goal}
@@ -99,7 +91,7 @@ def run(
         for goal in goals
         for name in names
         for method in methods
-        if method not in _PEERS or (base, goal) == ("fixed", "joints")
+        if method not in PEERS or (base, goal) == ("fixed", "joints")
     ]
     function = functools.partial(_record, folder=folder, robot=robot)
     return runner.run(
@@ -157,7 +149,7 @@ def _compare_lengths(records: Sequence[Record]) -> str:
     """Return how long our paths are, relative to the shortest of the others."""
     ratios = []
     for own in select(records, method="VKC", base="fixed", goal="joints", success=True):
-        same = [r for r in records if r["problem"] == own["problem"] and r["method"] in _PEERS]
+        same = [r for r in records if r["problem"] == own["problem"] and r["method"] in PEERS]
         others = values(select(same, success=True), "joint_length")
         if others:
             ratios.append(own["joint_length"] / min(others))
@@ -178,8 +170,9 @@ def _record(spec: dict[str, Any], *, folder: str, robot: str) -> dict[str, Any]:
     exact = build_program(PeerProblem(problem.scene, (Configure(problem.goal),)), options)
     is_valid = _is_valid(exact)
     method, seed, began = spec["method"], spec["seed"], time.process_time()
-    if method in _PEERS:
-        found, own_time = _plan_by_peer(own, options, method, seed, spec["time_limit"])
+    if method in PEERS:
+        found, peer = plan_by_peer(own, method, seed, Clock(spec["time_limit"]), options)
+        own_time = peer.own
     else:
         found = plan(
             own.scene, own.steps, options=options, seed=seed, time_limit=spec["time_limit"]
@@ -208,17 +201,6 @@ def _is_valid(problem: TrajectoryProblem) -> bool:
     goal = np.clip(problem.start, problem.lower[-1], problem.upper[-1])
     shortfall = compute_shortfall(problem, np.array([problem.start, goal]), 1)
     return bool((shortfall <= ACCEPTED_SHORTFALL).all())
-
-
-def _plan_by_peer(
-    own: PeerProblem, options: Options, method: str, seed: int, limit: float
-) -> tuple[Plan, float]:
-    """Return a peer's plan, and the CPU time of its solver [s]."""
-    program, clock = build_program(own, options), Clock(limit)
-    judge = functools.partial(validate_path, own, program, name=method, seed=seed)
-    accept: Callable[[Floats], bool] = lambda path: judge(path, "rejected").success  # noqa: E731
-    found = _PEERS[method][0](own, program, seed, clock, accept)
-    return judge(found.path, found.status), found.own
 
 
 def _measure(problem: TrajectoryProblem, trajectory: Trajectory) -> dict[str, Any]:

@@ -149,7 +149,11 @@ def read_problem(
     }
     empty = Scene.from_document(document, ".")
     state = asked.start_state.joint_state
-    values = dict(zip(state.name, state.position, strict=False))
+    if len(state.name) != len(state.position):
+        expected, got = f"{len(state.name)} positions", len(state.position)
+        field = "start_state.joint_state"
+        raise InputError("wrong number", file=request, field=field, expected=expected, got=got)
+    values = dict(zip(state.name, state.position, strict=True))
     arm = empty.robot.coordinates.names[3:]
     start = {name: values[name] for name in arm if name in values}
     standing = empty.with_start(arm=start)

@@ -211,7 +211,7 @@ def test_obstruction_is_named() -> None:
     search = OpenSearch(make_sampler(problem), 0, ends[0], ends[1:], guide, allowed=0.0)
     assert search.find_path(STEPS, 2000) is None
     for tree in search.trees:
-        tree.cut(len(tree) - 1)
+        tree.remove_branch(len(tree) - 1)
     pair = search.find_obstruction()
     assert pair is not None
     assert {"left", "right"} & {*pair}

@@ -34,13 +34,22 @@ from vkc_pin.benchmarks.peers.optimized import plan_by_trajopt
 from vkc_pin.benchmarks.peers.projected import plan_by_projection
 from vkc_pin.benchmarks.peers.sampled import plan_by_sampling
 from vkc_pin.benchmarks.peers.tasks import TASKS, PeerProblem, build_program, make_problem
+from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.optional_imports import import_optional
 from vkc_pin.world.trajectory.formats.archives import PlanStatus
 
-__all__ = ["METHODS", "PEERS", "TIME_LIMIT", "format_results", "run"]
+__all__ = [
+    "METHODS",
+    "PEERS",
+    "TIME_LIMIT",
+    "find_versions",
+    "format_results",
+    "plan_by_peer",
+    "run",
+]
 
 PEERS: Mapping[str, tuple[Peer, str, str]] = {
     "trajopt": (plan_by_trajopt, "tesseract_robotics", "tesseract-robotics-nanobind"),
@@ -100,7 +109,7 @@ def run(
         "tasks": names,
         "methods": chosen,
     }
-    settings |= {"time_limit": time_limit, "peers": _find_versions(chosen)}
+    settings |= {"time_limit": time_limit, "peers": find_versions(chosen)}
     specs = [
         {
             "key": f"{task}/{number:04d}/{method}",
@@ -154,8 +163,8 @@ def _row(task: str, method: str, records: Sequence[Record]) -> list[str]:
     return [task, method, count(records), str(late), *times, *own, *lengths, *least]
 
 
-def _find_versions(methods: Sequence[str]) -> dict[str, str]:
-    """Return the versions of the peers' packages."""
+def find_versions(methods: Sequence[str]) -> dict[str, str]:
+    """Return the versions of the packages of the peers among some methods."""
     found = {}
     for _, module, package in (PEERS[method] for method in methods if method in PEERS):
         try:
@@ -172,7 +181,7 @@ def _record(spec: dict[str, Any], *, folder: str) -> dict[str, Any]:
     clock = Clock(spec["time_limit"])
     found = PeerResult()
     if method in PEERS:
-        plan_of, found = _by_peer(own, method, number, clock)
+        plan_of, found = plan_by_peer(own, method, number, clock)
     else:
         plan_of = _by_us(own, method, number, spec["time_limit"])
         took = plan_of.metrics  # by the clock: their share of the CPU time counts
@@ -196,9 +205,11 @@ def _record(spec: dict[str, Any], *, folder: str) -> dict[str, Any]:
     return trial(plan_of, method=method, seed=seed, **more)
 
 
-def _by_peer(own: PeerProblem, method: str, seed: int, clock: Clock) -> tuple[Plan, PeerResult]:
+def plan_by_peer(
+    own: PeerProblem, method: str, seed: int, clock: Clock, options: Options | None = None
+) -> tuple[Plan, PeerResult]:
     """Return a peer's plan and result."""
-    problem = build_program(own)
+    problem = build_program(own, options)
     judgements: dict[int, Plan] = {}
 
     def accept(path: Floats) -> bool:

@@ -19,10 +19,18 @@ from vkc_pin.planning.initialization.open_trees import Guide, OpenSearch
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.task.phases import Phase
 
-FIRST_CHECKS = 50_000
-"""Collision checks after which a search with trees pauses for the first time."""
+__all__ = [
+    "FIRST_CHECKS",
+    "AStarPaths",
+    "CurvePaths",
+    "Interpolator",
+    "Paths",
+    "RrtPaths",
+    "make_base_paths",
+]
 
-__all__ = ["AStarPaths", "CurvePaths", "Interpolator", "Paths", "RrtPaths", "make_base_paths"]
+FIRST_CHECKS = 50_000
+"""Collision checks after which the first search with trees ends."""
 
 
 class AStarPaths:
@@ -78,7 +86,7 @@ class RrtPaths:
         self._failures: Counter[int] = Counter()  # consecutive ones per phase
         # Configurations at which the motion may end, shape (E, n).
         self.final_ends = np.empty((0, self.problem.chain.size))
-        # What the last search for an open path, if it failed, found between start and goal.
+        # Pair that collides between start and goal, if the last search for an open path failed.
         self.obstruction: tuple[str, str] | None = None
 
     def find_path(
@@ -87,8 +95,11 @@ class RrtPaths:
         """See `AStarPaths.find_path`."""
         problem, size = self.problem, self.sampler.robot_size
         self.obstruction, guide, last = None, None, last.copy()
-        arms = self._list_postures(phase, first[3:size], last[3:size])
-        if problem.chain.robot.base != "fixed":
+        is_fixed = problem.chain.robot.base == "fixed"
+        arms = last[None, 3:size]
+        if not (is_fixed and reaches):
+            arms = self._list_postures(phase, first[3:size], last[3:size])
+        if not is_fixed:
             poses = self.routes.find_guide_path(phase, first[:3], last[:3], 2 * steps)
             if poses is None:
                 return None
@@ -262,20 +273,17 @@ class Interpolator:
 
     def _note_missing_path(self, phase: Phase, start: Floats, end: Floats) -> None:
         """Note that a phase has no path of the base between places on the floor, shape (2,)."""
-        obstruction = self.paths.obstruction if isinstance(self.paths, RrtPaths) else None
-        if self.problem.chain.robot.base == "fixed":
-            text = "found no path for the arm"
-        else:
-            text = "found no path for the base"
-        if any(note.startswith(f"{phase.name}: {text}") for note in self.blocked):
+        is_fixed = self.problem.chain.robot.base == "fixed"
+        text = f"{phase.name}: found no path for the {'arm' if is_fixed else 'base'}"
+        if any(note.startswith(text) for note in self.blocked):
             return
-        if self.problem.chain.robot.base != "fixed":
+        if not is_fixed:
             (x, y), (u, v) = start, end
             text += f" from ({x:.2f}, {y:.2f}) to ({u:.2f}, {v:.2f})"
-        if obstruction is not None:
-            first, second = obstruction
+        if isinstance(self.paths, RrtPaths) and self.paths.obstruction is not None:
+            first, second = self.paths.obstruction
             text += f": between start and goal, {first} meets {second}"
-        self.blocked.append(f"{phase.name}: {text}")
+        self.blocked.append(text)
 
     def _find_via_points(
         self, ends: Floats, number: int, previous: Phase | None, segments: int

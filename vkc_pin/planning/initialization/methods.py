@@ -320,7 +320,7 @@ class _RrtSearch(_GuessSearch):
         return super()._interpolate(path, found)
 
     def _is_same(self, path: Floats, other: Floats) -> bool:
-        return False  # trees lead another way each time
+        return False  # trees find another path each time
 
     def _is_sufficient(self, z: Floats, shortfall: float, penetration: float) -> bool:
         return penetration <= MAX_GOOD_PENETRATION

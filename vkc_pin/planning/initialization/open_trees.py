@@ -3,7 +3,7 @@
 RRT-Connect (Kuffner and LaValle, ICRA 2000) in all coordinates of the robot. Samples are uniform,
 so that every path is found in the end. Where the base drives, half of them are near a guide path of
 it, with arm postures that are likely to be needed there: narrow passages are found quickly.
-Three choices decide how soon an arm finds its way out of a shelf or a cage:
+Three choices decide how soon a path leads out of a shelf or a cage:
 
 - A tree grows by whole pieces of at most `_PIECE`, never by a part of one that ends at an obstacle.
   Otherwise the pocket around a narrow goal fills with nodes at its walls.
@@ -38,8 +38,8 @@ _SHORTCUT_ROUNDS, _SHORTCUTS = 10, 20  # lines between random points of a path, 
 _STRAIGHTENING_ROUNDS = 3
 _PRODUCT_SIZE = 200_000  # multiplications in a product of matrices that needs no threads
 _FAR = 1e6  # scaled coordinates of nodes that are cut off
-# Searches for an arm go on for other ways until this multiple of the checks of the first, and find
-# at most so many paths; the shortest is taken
+# An arm on a fixed base searches further paths, until this multiple of the checks of the first one
+# or this number of paths; the shortest is used
 _EFFORT, _PATHS = 2, 5
 _MIN_DETOUR = 1e-6  # [rad] by which a corner is further from its neighbours than on a line
 _MIN_SAVING = 1e-3  # relative saving in length that a shortcut needs
@@ -86,7 +86,7 @@ class _Tree:
             nodes.append(int(self.parents[nodes[-1]]))
         return nodes
 
-    def cut(self, node: int) -> None:
+    def remove_branch(self, node: int) -> None:
         """Make a node and all its descendants unreachable."""
         cut = np.zeros(len(self.z), bool)
         cut[node] = True
@@ -170,21 +170,21 @@ class OpenSearch:
         first = self._connect(max_checks) if self.has_ends else None
         if first is None:
             return None
-        ways, limit = [first], _EFFORT * self.checks
-        while self.guide is None and len(ways) < _PATHS and self.checks < limit:
+        paths, limit = [first], _EFFORT * self.checks
+        while self.guide is None and len(paths) < _PATHS and self.checks < limit:
             self._reset_trees()
             other = self._connect(limit)
             if other is not None:
-                ways.append(other)
-        shorter = [self._cut_corners(way, _CHECK_STEP) for way in ways]
+                paths.append(other)
+        shorter = [self._cut_corners(path, _CHECK_STEP) for path in paths]
         best = int(np.argmin([self._measure_along(path)[-1] for path in shorter]))
         path = self._straighten(shorter[best], _CHECK_STEP)
         if not self._are_lines_free(path[:-1], path[1:], _FINE_STEP).all():
-            path = self._straighten(self._cut_corners(ways[best], _FINE_STEP), _FINE_STEP)
+            path = self._straighten(self._cut_corners(paths[best], _FINE_STEP), _FINE_STEP)
         return self._resample(path, steps)
 
     def find_obstruction(self) -> tuple[str, str] | None:
-        """Return the names of what collides first between the places where the trees are nearest.
+        """Return the pair that collides first between the nearest nodes of the trees, by its names.
 
         None: one of the ends is in collision.
         """
@@ -284,7 +284,7 @@ class OpenSearch:
             if len(nodes) > 1:
                 free = self._are_lines_free(each.z[nodes[1:]], each.z[nodes[:-1]], _FINE_STEP)
                 for blocked in np.flatnonzero(~free):
-                    each.cut(nodes[int(blocked)])
+                    each.remove_branch(nodes[int(blocked)])
                 is_whole = is_whole and bool(free.all())
         if not is_whole:
             return None

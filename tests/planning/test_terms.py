@@ -184,7 +184,8 @@ def test_constraint_can_represent_an_obstacle() -> None:
 def test_infeasible_constraint_is_reported() -> None:
     never = vkc.Constraint("never", lambda s: s.position("tool")[2], lower=9.0)
     options = vkc.Options(reach_waypoints=5, max_restarts=1, max_outer=4)
-    plan = vkc.plan(make_hall(), [vkc.GoTo(0.5, 0.0)], options=options, terms=[never])
+    steps = [vkc.GoTo(0.5, 0.0)]
+    plan = vkc.plan(make_hall(), steps, options=options, terms=[never], max_evaluations=2000)
     assert not plan.success
     assert "term never:" in plan.summary()
     violations = [one for one in plan.report.violations if one.constraint == "term"]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from vkc_pin.planning.kinematics import machine_code
 from vkc_pin.planning.kinematics.machine_code import CACHE_VARIABLE, Libraries
 
 
@@ -13,6 +14,7 @@ from vkc_pin.planning.kinematics.machine_code import CACHE_VARIABLE, Libraries
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Libraries:
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setattr(machine_code, "_NICENESS", 0)  # other tests run beside these
     found = Libraries.open_default()
     assert found is not None
     return found

@@ -80,12 +80,12 @@ _COMPILER_TIMEOUT = 600.0  # [s], timeout of the compiler, which takes 1 to 2 s 
 _COMPARISON_SAMPLES = 20
 _WORKER_SCRIPT = """
 import os, sys
-os.nice(19)
-sys.path[:] = sys.argv[3:]
+os.nice(int(sys.argv[3]))
+sys.path[:] = sys.argv[4:]
 from vkc_pin.planning.kinematics.machine_code import compile_jobs
 compile_jobs(sys.argv[1], int(sys.argv[2]))
 """
-_NICE_COMMAND = ("nice", "-n", "19")  # if available, Python itself starts with low priority
+_NICENESS = 19  # of compilers: planning goes first
 _LOAD_LOCK = threading.Lock()
 
 
@@ -420,8 +420,10 @@ def _start_worker_if_idle(folder: Libraries) -> subprocess.Popen[bytes] | None:
     if not has_python() or (lock := folder.lock()) is None:
         return None
     try:  # the process inherits the lock
-        nice = _NICE_COMMAND if shutil.which(_NICE_COMMAND[0]) else ()
-        arguments = (str(folder.path), str(lock), *map(os.path.abspath, sys.path))
+        # Where there is such a command, Python itself starts with low priority.
+        nice = ["nice", "-n", str(_NICENESS)] if shutil.which("nice") else []
+        increment = 0 if nice else _NICENESS
+        arguments = map(str, [folder.path, lock, increment, *map(os.path.abspath, sys.path)])
         command = [*nice, sys.executable, "-P", "-c", _WORKER_SCRIPT, *arguments]
         process = _start_process(command, folder.path, lock)
     finally:

@@ -131,6 +131,7 @@ def build(kind: str, folder: Path) -> Path:
     return built
 
 
+@pytest.mark.long
 def test_sdist_is_small(tmp_path: Path) -> None:
     assert build("sdist", tmp_path).stat().st_size < 8e6
 

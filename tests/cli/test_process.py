@@ -86,7 +86,7 @@ def check_complete(folder: Path) -> set[str]:
     ("redirection", "words", "code"),
     [
         pytest.param(">PIPE", TIMED_OUT, 1, marks=pytest.mark.long),
-        ("2>FULL", TIMED_OUT, 1),
+        pytest.param("2>FULL", TIMED_OUT, 1, marks=pytest.mark.long),
         (">&- 2>&- <&-", INFEASIBLE, 3),
     ],
 )

@@ -72,6 +72,7 @@ def test_plan_is_the_same_after_a_hundred_other_plans() -> None:
     assert compute_hash(plan_door(planner)) == hash_in_process("door")
 
 
+@pytest.mark.long
 def test_plan_is_the_same_with_a_tiny_cache() -> None:
     planner = vkc.Planner(entries=1, megabytes=1e-3)
     assert compute_hash(plan_door(planner)) == hash_in_process("door")

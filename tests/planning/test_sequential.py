@@ -262,7 +262,7 @@ LONG = pytest.mark.long
     [
         ([ONTO_RACK], {}, 0),
         pytest.param([ONTO_RACK], {"window": 1}, 0, marks=LONG),
-        ([GRASP, ONTO_RACK], {}, 0),
+        pytest.param([GRASP, ONTO_RACK], {}, 0, marks=LONG),
         pytest.param([GRASP, AWAY, ONTO_RACK], {}, 0, marks=LONG),
         pytest.param([GRASP, ONTO_RACK, AWAY], {}, 0, marks=LONG),
         pytest.param([AWAY, ONTO_RACK, AWAY], {}, 1, marks=LONG),

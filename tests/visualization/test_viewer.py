@@ -366,6 +366,7 @@ def test_pages_that_do_not_read_are_disconnected(
         assert count_received(late, size) >= size, "a new page gets the scene"
 
 
+@pytest.mark.long
 def test_small_commands_do_not_fill_the_memory(
     fresh_server: tuple[subprocess.Popen[bytes], str, int],
 ) -> None:
@@ -776,9 +777,10 @@ return { stamps };
             marks=pytest.mark.long,
         ),
         # The end is shown for 2 s, also after the motion was started again there.
-        (
+        pytest.param(
             [(0, "4"), (1500, ""), (3400, "again"), (3500, ""), (5000, ""), (6900, ""), (7100, "")],
             [0.0, 6.0, 6.0, 0.0, 6.0, 6.0, 0.0],
+            marks=pytest.mark.long,
         ),
     ],
 )

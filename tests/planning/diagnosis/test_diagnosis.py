@@ -123,7 +123,7 @@ def make_door_beside_a_wall() -> vkc.Scene:
     ("make_scene", "name", "goal", "cause"),
     [
         (make_far_drawer, "drawer.slide", 0.0, "out of reach"),
-        (make_door_beside_a_wall, "door.hinge", -1.4, "– wall"),
+        pytest.param(make_door_beside_a_wall, "door.hinge", -1.4, "– wall", marks=pytest.mark.long),
     ],
 )
 def test_range_of_a_blocked_joint(

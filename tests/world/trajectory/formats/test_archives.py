@@ -175,7 +175,7 @@ print(int(peak[1]) / 1e3, time.process_time() - before)
 """
 
 
-@pytest.mark.parametrize("make", [_make_bomb, _nest_lists])
+@pytest.mark.parametrize("make", [_make_bomb, pytest.param(_nest_lists, marks=pytest.mark.long)])
 def test_large_contents_are_rejected_before_they_are_unpacked(
     tmp_path: Path, saved: Path, make: Callable[[Any], Any]
 ) -> None:

@@ -34,7 +34,7 @@ _CHECK_STEP, _FINE_STEP = 0.05, 0.01  # between collision checks while trees gro
 _SAMPLES = 32  # towards which a tree grows at once
 # largest standard deviation of guided samples from guide path and likely postures
 _BASE_SPREAD, _ARM_SPREAD = 0.1, 0.4  # [m] and [rad]
-_SHORTCUT_ROUNDS, _SHORTCUTS = 10, 20  # lines between random points of a path, tried at once
+_SHORTCUT_ROUNDS, _SHORTCUTS = 5, 20  # lines between random points of a path, tried at once
 _STRAIGHTENING_ROUNDS = 3
 _PRODUCT_SIZE = 200_000  # multiplications in a product of matrices that needs no threads
 _FAR = 1e6  # scaled coordinates of nodes that are cut off
@@ -324,14 +324,37 @@ class OpenSearch:
         return np.asarray(free == counts)
 
     def _count_free_pieces(self, starts: Floats, ends: Floats, pieces: Ints) -> Ints:
-        """Return how many pieces of straight lines are free, from their starts on, shape (B,)."""
+        """Return how many pieces of straight lines are free, from their starts on, shape (B,).
+
+        Most lines are blocked in their first piece, which is therefore checked alone.
+        """
         lengths = self._measure(starts, ends) / pieces
         steps = np.maximum(np.ceil(lengths / _CHECK_STEP).astype(int), 1)
         counts = pieces * steps
-        lines, edges = np.repeat(np.arange(len(counts)), counts), np.cumsum([0, *counts])
-        share = (np.arange(edges[-1]) - edges[lines] + 1.0) / counts[lines]
-        free = self._count_free(starts[lines] + share[:, None] * (ends - starts)[lines], edges)
+        free = self._count_free_along(starts, ends, counts, np.zeros_like(steps), steps)
+        longer = np.flatnonzero((free == steps) & (pieces > 1))
+        free[longer] += self._count_free_along(
+            starts[longer], ends[longer], counts[longer], steps[longer], counts[longer]
+        )
         return np.asarray(free // steps)
+
+    def _count_free_along(
+        self, starts: Floats, ends: Floats, counts: Ints, first: Ints, last: Ints
+    ) -> Ints:
+        """Return how many configurations along lines precede the first collision, shape (B,).
+
+        Args:
+            starts: Starts of the lines, shape (B, m).
+            ends: Their ends, shape (B, m).
+            counts: Number of equidistant configurations behind each start, shape (B,).
+            first: Number of the first one that is checked, from 0, shape (B,).
+            last: Number of the first one that is not checked any more, shape (B,).
+        """
+        checked = last - first
+        lines, edges = np.repeat(np.arange(len(counts)), checked), np.cumsum([0, *checked])
+        number = first[lines] + np.arange(edges[-1]) - edges[lines] + 1.0
+        share = (number / counts[lines])[:, None]
+        return self._count_free(starts[lines] + share * (ends - starts)[lines], edges)
 
     def _cut_corners(self, path: Floats, step: float) -> Floats:
         """Replace pieces of a path, shape (P, m), between random points on it by straight lines.

@@ -34,7 +34,9 @@ _CHECK_STEP, _FINE_STEP = 0.05, 0.01  # between collision checks while trees gro
 _SAMPLES = 32  # towards which a tree grows at once
 # largest standard deviation of guided samples from guide path and likely postures
 _BASE_SPREAD, _ARM_SPREAD = 0.1, 0.4  # [m] and [rad]
-_SHORTCUT_ROUNDS, _SHORTCUTS = 5, 20  # lines between random points of a path, tried at once
+_SHORTCUTS = 20  # lines between random points of a path, tried at once
+# Shortcuts end with a round that saves less than this share of the length
+_ROUND_SAVING = 0.01
 _STRAIGHTENING_ROUNDS = 3
 _PRODUCT_SIZE = 200_000  # multiplications in a product of matrices that needs no threads
 _FAR = 1e6  # scaled coordinates of nodes that are cut off
@@ -361,8 +363,9 @@ class OpenSearch:
 
         Many are checked at once; of those that overlap, the one that saves most is used.
         """
-        for _ in range(_SHORTCUT_ROUNDS):
-            passed = self._measure_along(path)
+        passed, before_round = self._measure_along(path), np.inf
+        while passed[-1] < (1.0 - _ROUND_SAVING) * before_round:
+            before_round = passed[-1]
             at = np.sort(self.rng.uniform(0.0, passed[-1], (_SHORTCUTS, 2)), axis=1)
             ends = _interpolate(at.ravel(), passed, path).reshape(_SHORTCUTS, 2, -1)
             savings = at[:, 1] - at[:, 0] - self._measure(ends[:, 0], ends[:, 1])
@@ -376,6 +379,7 @@ class OpenSearch:
                 before, after = passed < at[k, 0], passed > at[k, 1]
                 path = np.vstack([path[before], ends[k], path[after]])
                 passed = np.concatenate([passed[before], at[k], passed[after]])
+            passed = self._measure_along(path)
         return path
 
     def _straighten(self, path: Floats, step: float) -> Floats:

@@ -6,11 +6,13 @@ instead of planning them.
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
+import nbformat
 import numpy as np
 import pinocchio as pin
 
@@ -40,6 +42,7 @@ CORRIDOR = (1.6, 0.0, 0.3), (-7.4, -1.4, 7.2)
 AISLE = (2.35, 2.5, 0.2), (-2.9, -3.0, 6.2)
 HOME = (0.1, -0.3, 0.0), (-1.5, -8.5, 9.0)
 KITCHEN = (-2.1, 2.4, 0.7), (0.1, -1.0, 2.9)
+SHELF = (0.5, 0.05, 0.3), (-0.5, -1.35, 0.95)
 TRAY = (0.0, -0.5, 0.5), (-3.2, -2.6, 2.6)
 PUSHED = (2.3, -0.2, 0.8), (-0.5, -2.6, 2.9)
 PUSHING = 0.7  # share of the duration at the open door
@@ -247,6 +250,18 @@ def gap_picture(through: vkc.Plan) -> None:
     picture(through, "gap_table", WIDE, float(times[inside] / times[-1]))
 
 
+def arm_picture() -> None:
+    """Write a picture of an arm in a shelf, with the plan of a notebook."""
+    notebook = nbformat.read(ROOT / "notebooks" / "11_problems_of_others.ipynb", as_version=4)
+    cells = {cell.id: cell.source for cell in notebook.cells}
+    names: dict[str, Any] = {}
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        for cell in ("problem", "plan"):
+            exec(cells[cell], names)
+    look(*SHELF)
+    picture(names["plan"], "arm_in_clutter", WIDE, 1.0)
+
+
 def tray_picture() -> None:
     """Write a picture of a carried tray."""
     look(*TRAY)
@@ -421,6 +436,7 @@ def main() -> int:
     import_picture()
     chore_pictures(chore)
     gap_picture(through)
+    arm_picture()
     tray_picture()
     push_picture()
     bases_picture()

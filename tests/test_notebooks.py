@@ -109,6 +109,12 @@ EXPECTED: dict[str, dict[str, tuple[str, ...]]] = {
         "scene": (r"oven\.\w+, approach .*: reached from",),
         "plan": (r"^kitchen: success — reach oven.\w+, move oven.microwave", VALID),
     },
+    "11_problems_of_others": {
+        "problem": ("panda, objects none, 7 obstacles",),
+        "plan": ("^shelf_scene0065: success — configure", VALID),
+        "pose": ("^shelf_scene0065: success — reach with panda_hand_tcp", VALID),
+        "driving": ("joint values +success", "pose +success", r"driving +success: base [0-9.]+ m"),
+    },
 }
 
 

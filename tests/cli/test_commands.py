@@ -49,6 +49,7 @@ def test_plan_prints_a_report_and_writes_every_output(run: RunCommand) -> None:
     assert len(list(Path(outputs["plots"]).glob("*.png"))) >= 3
 
 
+@pytest.mark.long
 def test_check_reports_reached_and_blocked_attachments(run: RunCommand) -> None:
     result = run("check drawer --plot drawer.png")
     assert result.code == 0

@@ -102,6 +102,7 @@ def test_files_are_written_when_outputs_are_closed(
         assert "wrote plan.csv" in done.stdout
 
 
+@pytest.mark.long
 def test_progress_on_a_full_device_does_not_fail(tmp_path: Path, shell: Shell) -> None:
     done = shell("2>FULL", f"{SUCCESS} --save plan.npz")
     assert done.returncode == 0, done
@@ -109,6 +110,7 @@ def test_progress_on_a_full_device_does_not_fail(tmp_path: Path, shell: Shell) -
     assert "drawer: success" in done.stdout
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("words", "code"),
     [pytest.param(INFEASIBLE, 3, marks=pytest.mark.long), (SUCCESS, 2)],
@@ -127,6 +129,7 @@ def test_help_on_closed_and_full_outputs(redirection: str, code: int, shell: She
     assert shell(redirection, "--help").returncode == code
 
 
+@pytest.mark.long
 def test_characters_outside_the_encoding_are_escaped(
     shell: Shell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -222,6 +225,7 @@ def test_ctrl_c_while_writing_leaves_complete_files(delay: float, tmp_path: Path
     assert {"plan.npz"} <= check_complete(tmp_path)
 
 
+@pytest.mark.long
 def test_ignored_ctrl_c_stays_ignored(tmp_path: Path) -> None:
     """Background processes of scripts ignore Ctrl-C."""
     command = [*COMMAND, *SUCCESS.split(), "--quiet", "--json", "plan.json"]

@@ -56,6 +56,7 @@ def test_images_are_read_back(dataset: Dataset) -> None:
         assert any(name.startswith(f"{episode.about['object']}.") for name in visible)
 
 
+@pytest.mark.long
 def test_check_renders_images_again(copy: Path, shard: Path) -> None:
     """The check reports the three modified images and no others."""
     with h5py.File(shard, "r+") as file:
@@ -74,6 +75,7 @@ def test_check_renders_images_again(copy: Path, shard: Path) -> None:
     assert all(start.startswith(f"episode {number}: ") for start, _ in starts)
 
 
+@pytest.mark.long
 def test_check_without_opengl_reports_that_pixels_are_not_compared(
     dataset: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -87,6 +87,7 @@ def test_leftovers_of_killed_runs_are_removed(dataset: Dataset, copy: Path) -> N
     assert read_contents(copy) == read_contents(dataset.folder)
 
 
+@pytest.mark.long
 def test_lerobot_layout_is_extended_with_its_dataset(tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
     for episodes, lerobot in ((1, True), (2, False)):

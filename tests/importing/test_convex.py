@@ -207,6 +207,7 @@ def test_pieces_contain_the_mesh_and_leave_cavities_free(
         assert measure_uncovered(pieces.meshes, np.array([point])) > distance - 0.02 - 1e-4
 
 
+@pytest.mark.long
 def test_long_narrow_strips_are_cut() -> None:
     """The grid that coarsens a ribbon of 1 m must be finer than the ribbon's width."""
     x, k = np.linspace(0.0, 1.0, 400), np.arange(399)

@@ -137,6 +137,7 @@ def test_broken_meshes_are_rejected(folder: Path, name: str, data: bytes) -> Non
         load_mesh(folder / name)
 
 
+@pytest.mark.long
 def test_ctrl_c_ends_an_import(folder: Path) -> None:
     pytest.importorskip("mujoco")
     (folder / "a.xml").write_text(MJCF.format('<include file="pipe"/>', ""), encoding="utf-8")

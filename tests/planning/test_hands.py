@@ -23,6 +23,7 @@ def handless() -> Scene:
     return dataclasses.replace(scene, robot=dataclasses.replace(scene.robot, touch_links=()))
 
 
+@pytest.mark.long
 def test_robot_that_cannot_grasp_is_named_in_the_report(handless: Scene) -> None:
     steps, options = [vkc.Actuate("drawer", {"slide": 0.2}, "handle")], vkc.Options(dist_safe=0.04)
     assert vkc.plan(vkc.load_scene("drawer"), steps, options=options).success

@@ -55,6 +55,7 @@ def test_handle_close_to_another_link_of_its_object_is_grasped(tmp_path: Path) -
     add_ledge(tmp_path, gap=0.012)  # restored, since the plan is judged again
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("gap", "clearance", "required"),
     [(0.012, 0.016, 0.016), pytest.param(0.003, None, 0.005, marks=pytest.mark.long)],

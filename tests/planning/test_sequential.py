@@ -156,6 +156,7 @@ def test_object_is_regrasped_to_be_placed(offset: float) -> None:
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("simultaneous", [True, pytest.param(False, marks=pytest.mark.long)])
 def test_another_grasp_replaces_one_that_prevents_placing(
     simultaneous: bool,
@@ -234,6 +235,7 @@ def test_attachments_share_the_budget(planner: Callable[..., vkc.Plan]) -> None:
     assert result.steps[0].attachment == "handle"
 
 
+@pytest.mark.long
 def test_failed_attachments_are_noted() -> None:
     scene = add_attachment(vkc.load_scene("drawer"), "drawer", "ceiling", 4.0)
     ceiling = scene.objects["drawer"].object.attachments["ceiling"]
@@ -284,6 +286,7 @@ def test_object_is_grasped_where_it_can_be_placed(
     assert plan.steps == (*steps[:grasping], named, *steps[grasping + 1 :])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "steps",
     [
@@ -299,6 +302,7 @@ def test_named_attachment_is_never_replaced(steps: list[vkc.Step], options: dict
     assert not any("oblique" in note for note in plan.report.notes)
 
 
+@pytest.mark.long
 def test_touch_tries_other_attachments() -> None:
     scene = add_attachment(vkc.load_scene("init_1"), "stick", "ceiling", 4.0)
     steps = [vkc.Touch("stick.tip", TARGET)]
@@ -307,6 +311,7 @@ def test_touch_tries_other_attachments() -> None:
     assert plan.steps == (vkc.Touch("stick.tip", TARGET, "grip"),)
 
 
+@pytest.mark.long
 def test_cheap_attempts_come_first() -> None:
     """An attachment whose goal is blocked is left after its first guess, for one that suits."""
     plan = vkc.plan(make_kitchen(), [ONTO_RACK])

@@ -38,6 +38,7 @@ def test_draft_is_not_solved_from_a_deep_guess() -> None:
     assert not any(result.is_solved for result in results)
 
 
+@pytest.mark.long
 def test_blocked_goal_may_be_due_to_a_kept_grasp_or_a_placed_object() -> None:
     scene = make_room(describe_table())
 

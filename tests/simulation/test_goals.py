@@ -190,6 +190,7 @@ def test_release_misses_what_does_not_stay() -> None:
     assert not result.ok
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("aside", "missed"), [(0.01, False), (0.1, True)])
 def test_tool_holds_only_what_it_touches(aside: float, missed: bool) -> None:
     """A stick's tip is to fetch a ball, which stands aside."""
@@ -241,6 +242,7 @@ def test_grasp_without_motion_is_measured_when_the_hand_closes(steps: list[vkc.S
     assert min(miss.amount for miss in aside.misses if miss.subject == "grasp of drawer") < 0.3
 
 
+@pytest.mark.long
 def test_released_free_object_is_grasped_before() -> None:
     steps = [vkc.Grasp("cup"), vkc.Release("cup"), vkc.GoTo(2.0, -2.2)]
     result = vkc.plan(vkc.load_scene("household"), steps).simulate()
@@ -308,6 +310,7 @@ def test_lever_may_return_when_it_is_released() -> None:
     assert [miss.subject for miss in plan.simulate().misses] == ["door.hinge", "door.hinge"]
 
 
+@pytest.mark.long
 def test_hand_that_misses_the_last_grasp_holds_nothing_then() -> None:
     plan = vkc.plan(vkc.load_scene("household"), [vkc.Grasp("cup")])
     assert plan.simulate().end_scene().held == {"cup": "side"}

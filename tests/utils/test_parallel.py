@@ -25,6 +25,7 @@ def test_tasks_run_once_in_any_number_of_processes(jobs: int) -> None:
     assert sorted((int(key), value) for key, value in found) == [(k, 2 * k) for k in range(20)]
 
 
+@pytest.mark.long
 def test_crashes_neither_lose_nor_repeat_other_tasks(tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     tasks = [(str(k), (str(tmp_path), k)) for k in range(8)]

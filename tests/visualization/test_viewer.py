@@ -465,6 +465,7 @@ BAD_MESSAGES = [
 ]
 
 
+@pytest.mark.long
 def test_invalid_messages_are_answered_and_leave_viewers_usable(viewer: Any, plan: Plan) -> None:
     assert visualization._server is not None
     address = visualization._server[1]
@@ -553,6 +554,7 @@ def take_picture(page: Path, moment: float) -> np.ndarray:
     return pixels
 
 
+@pytest.mark.long
 @needs_chromium
 @pytest.mark.browser
 def test_picture_changes_over_time(page: Path) -> None:
@@ -562,6 +564,7 @@ def test_picture_changes_over_time(page: Path) -> None:
     assert 0.005 < changed.mean() < 0.5, "the robot has moved, the room has not"
 
 
+@pytest.mark.long
 @needs_chromium
 @pytest.mark.browser
 @pytest.mark.parametrize("count", [3, pytest.param(5, marks=pytest.mark.long)])
@@ -698,6 +701,7 @@ def test_page_fits_screens_of_telephones(page: Path, size: tuple[int, int]) -> N
         assert found["filled"] > 0.7, "of 2: the paths extend along the height"
 
 
+@pytest.mark.long
 @needs_chromium
 @pytest.mark.browser
 @pytest.mark.parametrize("size", [(390, 844), pytest.param((1280, 720), marks=pytest.mark.long)])
@@ -717,6 +721,7 @@ def test_long_names_are_shown_whole(plan: Plan, tmp_path: Path, size: tuple[int,
     assert found["about"] <= size[0]
 
 
+@pytest.mark.long
 @needs_chromium
 @pytest.mark.browser
 def test_short_motions_have_a_slider_and_a_clock(plan: Plan, tmp_path: Path) -> None:

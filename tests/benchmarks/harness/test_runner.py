@@ -263,6 +263,7 @@ runner.run(make_trials(), solve_slowly, sys.argv[1], **more)
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("jobs", "kind"), [(1, signal.SIGKILL), (2, signal.SIGINT)])
 def test_stopped_process_keeps_finished_trials(
     tmp_path: Path, jobs: int, kind: signal.Signals

@@ -329,6 +329,7 @@ def test_narrow_door_is_closed_from_outside() -> None:
     assert plan.trajectory.positions[-1, 1] < 1.0  # the wall is at 1.25
 
 
+@pytest.mark.long
 def test_door_that_opens_towards_the_robot_does_not_lock_it_in() -> None:
     """With the least motion, the robot pulls the door open and ends behind it."""
     steps, notes = [vkc.Actuate("door", {"hinge": -1.5}), vkc.GoTo(4.1, -0.3)], list[str]()

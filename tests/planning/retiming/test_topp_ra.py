@@ -66,6 +66,7 @@ def test_no_speeds_without_limits() -> None:
     assert compute_speeds(make_line(1.0), np.array([0.0, 1.0]), unlimited, unlimited) is None
 
 
+@pytest.mark.long
 def test_matplotlib_is_not_imported() -> None:
     """The import takes half a second and serves only the plots of toppra, which still work."""
     code = """

@@ -182,6 +182,7 @@ def test_feasible_motions_are_improved_while_worthwhile(case: Case) -> None:
     assert solve_case(case).rounds < case()[0].options.max_outer
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3))
 def test_blocked_motions_end_early(seed: int) -> None:
     """The goal is deep in a block across the hall; noise imitates rounding errors."""

@@ -155,6 +155,7 @@ BEGINNING_INSIDE = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", BEGINNING_INSIDE)
 def test_overlap_at_the_start_gets_no_deeper(name: str) -> None:
     kind, begin, goal, obstacle = BEGINNING_INSIDE[name]

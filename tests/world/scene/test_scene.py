@@ -83,6 +83,7 @@ def test_start_clearance_includes_obstacles_and_objects(
     assert door.with_start(base=[*base, 0.0]).start_clearance() < -0.1
 
 
+@pytest.mark.long
 def test_sampling_needs_a_free_start_region(tmp_path: Path) -> None:
     region = "start_region: {x: [-1, 1], y: [-1, 1], yaw: any}\n"
     for other, message in (

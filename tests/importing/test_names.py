@@ -84,7 +84,6 @@ def test_links_of_a_robot_keep_their_names(tmp_path: Path) -> None:
     assert {*NAMES[4:10]} <= {*imported.robot.links}
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     ("import_file", "name", "description"),
     [

@@ -278,7 +278,7 @@ def test_rrt_guess_leads_through_a_narrow_gate(width: float) -> None:
     assert deepest < 0.01
     np.testing.assert_allclose(guess.z[-1, :3], GOAL, atol=1e-9)
     if width == TOO_NARROW:  # the arm at home just fits through the other gate
-        assert np.ptp(guess.z[:, 3:9], axis=0).max() > 0.25
+        assert np.ptp(guess.z[:, 3:9], axis=0).max() > 0.4
     (same,) = initialize(gate, "rrt", 0)
     np.testing.assert_array_equal(guess.z, same.z)
 

@@ -122,7 +122,7 @@ def draw_structure(draw: st.DrawFn) -> Structure:
     )
 
 
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=200, deadline=None, derandomize=True)
 @given(draw_structure(), st.integers(0, 2**16))
 def test_assembled_derivatives_equal_those_of_casadi(structure: Structure, seed: int) -> None:
     t = Transcription(structure, CACHE)

@@ -155,8 +155,13 @@ BEGINNING_INSIDE = {
 }
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("name", BEGINNING_INSIDE)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name == "closing drawer" else pytest.mark.long)
+        for name in BEGINNING_INSIDE
+    ],
+)
 def test_overlap_at_the_start_gets_no_deeper(name: str) -> None:
     kind, begin, goal, obstacle = BEGINNING_INSIDE[name]
     joint = JOINTS[kind]

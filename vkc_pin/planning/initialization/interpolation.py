@@ -95,12 +95,10 @@ class RrtPaths:
         """See `AStarPaths.find_path`."""
         problem, size = self.problem, self.sampler.robot_size
         self.obstruction, guide, last = None, None, last.copy()
-        is_fixed = problem.chain.robot.base == "fixed"
-        if is_fixed:
+        if problem.chain.robot.base == "fixed":
             arms = np.array([last[3:size], first[3:size], problem.chain.robot.home])
         else:
             arms = self._list_postures(phase, first[3:size], last[3:size])
-        if not is_fixed:
             poses = self.routes.find_guide_path(phase, first[:3], last[:3], 2 * steps)
             if poses is None:
                 return None

@@ -422,8 +422,7 @@ def _start_worker_if_idle(folder: Libraries) -> subprocess.Popen[bytes] | None:
     try:  # the process inherits the lock
         # Where there is such a command, Python itself starts with low priority.
         nice = ["nice", "-n", str(_NICENESS)] if shutil.which("nice") else []
-        increment = 0 if nice else _NICENESS
-        arguments = map(str, [folder.path, lock, increment, *map(os.path.abspath, sys.path)])
+        arguments = map(str, [folder.path, lock, _NICENESS, *map(os.path.abspath, sys.path)])
         command = [*nice, sys.executable, "-P", "-c", _WORKER_SCRIPT, *arguments]
         process = _start_process(command, folder.path, lock)
     finally:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import runpy
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,9 @@ from helpers.moveit_problems import ROBOT, make_request, make_scene, write
 
 from vkc_pin.benchmarks import arms
 from vkc_pin.benchmarks.harness.record import describe_environment
+from vkc_pin.benchmarks.moveit_problems import list_problems, read_problem
+
+ROOT = Path(__file__).parents[2]
 
 
 def make_record(method: str, length: float, **changes: Any) -> dict[str, Any]:
@@ -74,3 +78,28 @@ def test_unknown_choices_are_named(name: str, value: list[str], tmp_path: Path) 
     more: dict[str, Any] = {name: value}
     with pytest.raises(Exception, match=value[0]):
         arms.run(out=tmp_path / "out", folder=str(tmp_path), robot=ROBOT, **more)
+
+
+def test_problem_is_posed_to_another_arm(tmp_path: Path) -> None:
+    script = runpy.run_path(str(ROOT / "docs/make_arm_problems.py"))
+    scene = make_scene()
+    (shelf,) = scene["world"]["collision_objects"]
+    shelf["primitives"] = [{"type": "box", "dimensions": [0.1, 1.0, 0.1]}] * 2
+    upper = {"position": [0.7, 0.0, 0.9], "orientation": [0.0, 0.0, 0.0, 1.0]}
+    shelf["primitive_poses"] = [upper, {**upper, "position": [0.7, 0.0, 0.5]}]
+    given, made = tmp_path / "given", tmp_path / "made"
+    given.mkdir()
+    write(given, scene, make_request())
+    script["main"](str(given), ROBOT, "panda", str(made))
+    problem = read_problem(*list_problems(made)["0001"], "panda")
+    found = arms.run(
+        out=tmp_path / "out", folder=str(made), robot="panda", methods=["VKC"], progress=False
+    )
+    (record,) = found["trials"]
+    assert record["valid"]
+    assert record["success"]
+    assert len(problem.goal) == 7
+    tool = problem.scene.with_start(arm=dict(problem.goal)).tool_placement().translation
+    above, below = (shape.placement.translation for shape in problem.scene.obstacles)
+    assert below[2] - 0.05 < tool[2] < above[2] + 0.05
+    assert above[2] - below[2] == pytest.approx(0.4)

@@ -3,6 +3,7 @@ from __future__ import annotations
 import ast
 import importlib
 import inspect
+import os
 import pkgutil
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 import vkc_pin as vkc
+from vkc_pin.utils import disk_cache
 
 ROOT = Path(__file__).resolve().parent.parent
 # Compiled modules, and modules that run as scripts.
@@ -89,6 +91,26 @@ def test_heavy_dependencies_are_loaded_on_first_use() -> None:
         check=True,
     )
     assert done.stdout.splitlines() == ["[]", "[]", "['casadi', 'coal', 'pinocchio', 'pydantic']"]
+
+
+def test_scene_of_known_meshes_is_loaded_without_readers_of_meshes(tmp_path: Path) -> None:
+    heavy = ("trimesh", "scipy", "meshcat", "matplotlib", "mujoco")
+    loaded = f"[m for m in {heavy} if m in sys.modules]"
+    code = f"import sys, vkc_pin as vkc; vkc.load_scene('door'); print({loaded})"
+    found = [
+        subprocess.run(
+            [sys.executable, "-c", code],
+            cwd=ROOT,
+            env={**os.environ, disk_cache.CACHE_VARIABLE: str(tmp_path)},
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=True,
+        ).stdout
+        for _ in range(2)
+    ]
+    assert "trimesh" in found[0]
+    assert found[1] == "[]\n"
 
 
 def test_stub_lists_the_public_names() -> None:

@@ -14,6 +14,8 @@ from helpers.meshes import compute_excess
 from helpers.poles import POLE
 from scipy.spatial import ConvexHull
 
+from vkc_pin.utils import disk_cache
+from vkc_pin.world.files import meshes
 from vkc_pin.world.files.hulls import compute_hull, compute_outer_hull
 from vkc_pin.world.files.meshes import (
     get_triangles,
@@ -411,3 +413,31 @@ def test_hulls_of_small_parts_are_closed(size: float, middle: float) -> None:
             hull = trimesh.Trimesh(held - placed.mean(axis=0), get_triangles(shape))
             assert hull.volume == pytest.approx(expected, rel=1e-5)
             assert compute_excess(placed, compute_hull(placed)).max() < 2e-8
+
+
+def test_hull_on_disk_is_that_of_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(disk_cache.CACHE_VARIABLE, str(tmp_path / "cache"))
+    file = tmp_path / "part.stl"
+    trimesh.creation.icosphere(subdivisions=2).export(file)
+    meshes._load_hull.cache_clear()
+    built = load_convex(file)
+    meshes._load_hull.cache_clear()
+    read = load_convex(file)
+    np.testing.assert_array_equal(built.points(), read.points())
+    np.testing.assert_array_equal(get_triangles(built), get_triangles(read))
+    assert read.computeVolume() == built.computeVolume()
+    assert len(list((tmp_path / "cache").rglob("*.json"))) == 1
+    np.testing.assert_allclose(load_convex(file, 2.0).points(), 2.0 * np.asarray(built.points()))
+    trimesh.creation.box().export(file)
+    assert load_convex(file).computeVolume() == pytest.approx(1.0)
+    assert len(list((tmp_path / "cache").rglob("*.json"))) == 3
+
+
+def test_flat_mesh_warns_at_each_use(tmp_path: Path) -> None:
+    file = tmp_path / "sheet.stl"
+    corners = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
+    trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]]).export(file)
+    for _ in range(2):
+        meshes._load_hull.cache_clear()
+        with pytest.warns(UserWarning, match="flat"):
+            load_convex(file)

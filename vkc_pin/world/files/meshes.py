@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import codecs
 import contextlib
+import hashlib
 import io
+import json
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -25,6 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.utils.arrays import MAX_COORDINATE, Floats, Ints
+from vkc_pin.utils.disk_cache import load_or_build
 from vkc_pin.utils.interrupt import defer_interrupt
 from vkc_pin.world.files.collada import read_collada
 from vkc_pin.world.files.gltf import GLTF_SUFFIXES, GLTF_TO_Z_UP, check_gltf
@@ -53,6 +56,8 @@ __all__ = [
 
 _MAX_NEIGHBOURS = 255  # coal's corners have no more
 _MAX_CACHED_HULLS = 512  # that a process keeps: robots are loaded again and again
+# Of the hulls on disk: increase it whenever the same file would get another hull.
+_HULL_VERSION = 1
 _MAX_KEPT_MESHES = 256  # for display, likewise: a robot has 20
 _SMALLEST = 1e-6  # [m] size of meshes, below which triangles have no area in floating point
 _HULL_TOLERANCE = 1e-6  # how far, relatively, coal's volume and area may be from trimesh's
@@ -265,9 +270,38 @@ def load_convex(
 def _load_hull(
     file: Path, version: tuple[int, int], scale: tuple[float, ...]
 ) -> coal.Convex | None:
-    """Return the hull of a version of a mesh file; None if it is flat, since each use warns."""
-    points = load_mesh(file, scale).vertices
-    return None if thicken(np.asarray(points, float))[1] else make_convex_hull(points, file=file)
+    """Return the hull of a version of a mesh file; None if it is flat, since each use warns.
+
+    Corners and triangles are cached on disk: neither trimesh nor SciPy is imported for a hull that
+    is there. Files of the format glTF are read again, because their buffers may be other files.
+    """
+
+    def build() -> tuple[list[list[float]], list[list[int]]] | None:
+        points = load_mesh(file, scale).vertices
+        if thicken(np.asarray(points, float))[1]:
+            return None
+        hull = make_convex_hull(points, file=file)
+        return np.asarray(hull.points()).tolist(), get_triangles(hull).tolist()
+
+    kind = file.suffix.lower()
+    if kind == ".gltf":
+        found = build()
+    else:
+        content = hashlib.sha256(file.read_bytes()).hexdigest()
+        key = json.dumps(("hull", _HULL_VERSION, kind, scale, content))
+        found = load_or_build(key.encode(), build)
+    return None if found is None else _make_convex(*found)
+
+
+def _make_convex(vertices: ArrayLike, triangles: Iterable[Iterable[int]]) -> coal.Convex:
+    """Return a coal shape of the corners, shape (n, 3) [m], and triangles of a hull."""
+    corners = coal.StdVec_Vec3s()
+    corners.extend(np.asarray(vertices, float))
+    faces = coal.StdVec_Triangle()
+    faces.extend(coal.Triangle(*triangle) for triangle in triangles)
+    shape = coal.Convex(corners, faces)
+    shape.computeLocalAABB()
+    return shape
 
 
 def make_convex_hull(
@@ -305,10 +339,7 @@ def make_convex_hull(
         np.bincount(np.asarray(hull.faces).ravel()).max() > _MAX_NEIGHBOURS
     ):  # the tip of a finely meshed cone, a fine disc
         hull = compute_outer_hull(hull.vertices, vertices=60)
-    vertices, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
-    vertices.extend(np.asarray(hull.vertices, float))
-    triangles.extend(coal.Triangle(*face) for face in np.asarray(hull.faces).tolist())
-    shape = coal.Convex(vertices, triangles)
+    shape = _make_convex(hull.vertices, np.asarray(hull.faces).tolist())
     # Volumes of small hulls far from the origin are inexact; this one is about the hull's middle.
     held_points = np.asarray(shape.points())
     a, b, c = (held_points - held_points.mean(axis=0))[get_triangles(shape)].transpose(1, 0, 2)
@@ -318,7 +349,6 @@ def make_convex_hull(
         if not abs(held - wanted) <= _HULL_TOLERANCE * abs(wanted) or wanted <= 0.0:
             problem = f"coal does not hold this hull: wrong {what}"
             raise InputError(problem, file=file, field=about, expected=wanted, got=held)
-    shape.computeLocalAABB()
     return shape
 
 

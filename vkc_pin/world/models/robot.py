@@ -24,7 +24,12 @@ from vkc_pin.world.models.grafting import round_placement
 from vkc_pin.world.models.gripper import Gripper
 from vkc_pin.world.models.robot_model import load_visual_geometry
 from vkc_pin.world.models.robot_schema import Wheels
-from vkc_pin.world.models.shapes import compute_shape_distance, get_link_name, triangulate
+from vkc_pin.world.models.shapes import (
+    compute_bounding_box,
+    compute_shape_distance,
+    get_link_name,
+    triangulate,
+)
 
 __all__ = ["Base", "Robot"]
 
@@ -199,9 +204,15 @@ class Robot:
             pin.forwardKinematics(self.model, data, self.coordinates.q(z))
             digest.update(np.array([place.homogeneous for place in data.oMi]).tobytes())
         for shape in self.collision.geometryObjects:
-            points, faces = triangulate(shape.geometry)
-            digest.update(repr((shape.name, shape.parentJoint, points.shape, faces.shape)).encode())
-            digest.update(points.tobytes() + shape.placement.homogeneous.tobytes())
+            solid = shape.geometry
+            digest.update(repr((shape.name, shape.parentJoint, type(solid).__name__)).encode())
+            digest.update(shape.placement.homogeneous.tobytes())
+            if isinstance(solid, coal.Convex | coal.BVHModelBase):
+                dimensions = triangulate(solid)
+            else:  # the bounding box has all dimensions of these
+                dimensions = compute_bounding_box(shape)
+            for values in dimensions:
+                digest.update(repr(values.shape).encode() + values.tobytes())
         return digest.hexdigest()
 
     def opening(self, asked: float | None) -> float | None:

@@ -146,6 +146,10 @@ def triangulate(shape: coal.CollisionGeometry) -> tuple[Floats, NDArray[np.int64
     Returns:
         Vertices, shape (n, 3) [m], and faces, shape (m, 3).
     """
+    if isinstance(shape, coal.BVHModelBase | coal.Convex):
+        points = shape.points() if isinstance(shape, coal.Convex) else shape.vertices()
+        return np.array(points, float), get_triangles(shape)
+
     # trimesh catches Ctrl-C while it imports others, and would go on without them.
     with defer_interrupt():
         import trimesh.creation as make
@@ -172,9 +176,6 @@ def triangulate(shape: coal.CollisionGeometry) -> tuple[Floats, NDArray[np.int64
             height=length, radius=shape.radius, count=(_CIRCLE_SEGMENTS, _CIRCLE_SEGMENTS)
         )
         mesh.apply_translation([0.0, 0.0, -(mesh.bounds[0, 2] + mesh.bounds[1, 2]) / 2.0])
-    elif isinstance(shape, coal.BVHModelBase | coal.Convex):
-        points = shape.points() if isinstance(shape, coal.Convex) else shape.vertices()
-        return np.array(points, float), get_triangles(shape)
     else:
         raise InputError(
             "this shape cannot be drawn", expected="a solid or a mesh", got=type(shape).__name__

@@ -208,11 +208,13 @@ class Robot:
             digest.update(repr((shape.name, shape.parentJoint, type(solid).__name__)).encode())
             digest.update(shape.placement.homogeneous.tobytes())
             if isinstance(solid, coal.Convex | coal.BVHModelBase):
-                dimensions = triangulate(solid)
-            else:  # the bounding box has all dimensions of these
-                dimensions = compute_bounding_box(shape)
-            for values in dimensions:
-                digest.update(repr(values.shape).encode() + values.tobytes())
+                points, faces = triangulate(solid)
+                digest.update(repr((points.shape, faces.shape)).encode())
+                digest.update(points.tobytes() + faces.tobytes())
+            else:
+                # The bounding box has all dimensions of boxes, cylinders and the like.
+                _, half_extents = compute_bounding_box(shape)
+                digest.update(half_extents.tobytes())
         return digest.hexdigest()
 
     def opening(self, asked: float | None) -> float | None:

@@ -1,6 +1,6 @@
 """Poses problems to another arm in MoveIt's scenes: `make_arm_problems.py FOLDER ROBOT OTHER OUT`.
 
-FOLDER has problems as `vkc_pin.benchmarks.moveit_problems` reads them, for ROBOT. Problems in the
+FOLDER has problems as `vkc_pin.importing.moveit_problems` reads them, for ROBOT. Problems in the
 same scenes for the robot OTHER are written to the new folder OUT, in the same format and under the
 same names. The obstacles are moved so that the first turning joint of the other arm stands where
 that of the first arm did. The goal is a random free configuration with the tool among the
@@ -19,7 +19,7 @@ import pinocchio as pin
 import yaml
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.moveit_problems import list_problems, read_problem
+from vkc_pin.importing.moveit_problems import list_problems, read_problem
 from vkc_pin.planning.initialization.keyframes import find_free_configurations
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Bools, Floats

@@ -16,8 +16,7 @@ import pinocchio as pin
 from PIL import Image
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.harness.runner import LIMITS
-from vkc_pin.benchmarks.robot_object_matrix.pairs import make_pair, parse_requests, prepare_robot
+from vkc_pin.experiments.harness.runner import LIMITS
 from vkc_pin.visualization.plots.style import new_figure, save_figure, use_style
 from vkc_pin.visualization.room import load_drawn_parts
 from vkc_pin.world.trajectory.world_model import World
@@ -44,6 +43,13 @@ DOTS, PARTS = (
 )  # [pixels] between points, also of shadows
 SUN = np.array([-0.35, -0.45, 0.82]) / np.linalg.norm([-0.35, -0.45, 0.82])
 FLOOR, SKY, SHADOW = np.array([0.90, 0.89, 0.87]), np.array([0.97, 0.97, 0.98]), 0.82
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from tests.benchmarks.robot_object_matrix.pairs import (  # noqa: E402
+    make_pair,
+    parse_requests,
+    prepare_robot,
+)
 
 
 def plan_opening(robot: str, file: str, object_name: str, folder: Path) -> vkc.Plan:

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks import chores
+from vkc_pin.experiments import chores
 from vkc_pin.planning.initialization import interpolation, rrt
 from vkc_pin.planning.initialization.keyframes import compute_shortfall
 from vkc_pin.planning.nlp.problem import TrajectoryProblem

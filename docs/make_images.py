@@ -17,7 +17,7 @@ import numpy as np
 import pinocchio as pin
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks import chores, gap
+from vkc_pin.experiments import chores
 from vkc_pin.importing.pictures import plot_attachments
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.visualization import drawing
@@ -61,11 +61,13 @@ OPENED = {
     "refrigerator": ("hinge", 1.4),
 }
 
-sys.path.insert(0, str(ROOT / "tests"))
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 from helpers.browser import save_screenshot  # noqa: E402
 from helpers.door_closers import load_door_with_closer  # noqa: E402
 from helpers.grippers import write_cheeks_scene, write_gripper  # noqa: E402
 from helpers.homes import write_home_urdf  # noqa: E402
+
+from tests.benchmarks import gap  # noqa: E402
 
 
 def look(target: tuple[float, ...], position: tuple[float, ...]) -> None:

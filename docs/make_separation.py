@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.initialization import TARGET
+from vkc_pin.experiments.initialization import TARGET
 from vkc_pin.planning.initialization.methods import initialize
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.solver.loop import solve

@@ -31,8 +31,8 @@ from typing import Any
 
 import yaml
 
-from vkc_pin.benchmarks.harness.record import distribution
-from vkc_pin.benchmarks.harness.tables import describe_run, format_table
+from vkc_pin.experiments.harness.record import distribution
+from vkc_pin.experiments.harness.tables import describe_run, format_table
 
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
@@ -221,7 +221,7 @@ def evidence() -> str:
         file = (
             f"--json out/{name}.json" if "door" in name or name == "timing" else f"--out out/{name}"
         )
-        whole = f"`{'' if command.startswith('python') else 'vkc-pin bench '}{command} {file}`"
+        whole = f"`{command} {file}`"
         rows.append(
             [
                 f"[{entry['claim']}]({entry['page']})",
@@ -320,9 +320,7 @@ def format_record(name: str) -> str:
     whose = next(entry["module"] for entry in RECORDS if entry["record"] == name)
     if whose.startswith("tests."):
         sys.path.insert(0, str(ROOT))
-    module = importlib.import_module(
-        whose if whose.startswith("tests.") else f"vkc_pin.benchmarks.{whose}"
-    )
+    module = importlib.import_module(whose)
     text: str = module.format_results(result(name))
     return text
 

@@ -22,6 +22,7 @@ import pytest
 import yaml
 
 import vkc_pin as vkc
+from tests.benchmarks import commands
 from vkc_pin import Violation
 from vkc_pin.cli.commands import make_parser
 from vkc_pin.world.files.documents import Document, parse_document
@@ -166,8 +167,8 @@ def test_every_constraint_and_status_is_documented() -> None:
     assert [word for word in names if f"`{word}`" not in formulation] == []
 
 
-def find_commands() -> dict[str, argparse.ArgumentParser]:
-    """Return the parsers of all commands by name, such as "bench door"."""
+def find_commands(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    """Return the parsers of all commands of a parser by name, such as "bench door"."""
     found: dict[str, argparse.ArgumentParser] = {}
 
     def collect(parser: argparse.ArgumentParser, prefix: str) -> None:
@@ -180,27 +181,39 @@ def find_commands() -> dict[str, argparse.ArgumentParser]:
         if not inner:
             found[prefix] = parser
 
-    collect(make_parser(), "")
+    collect(parser, "")
     return found
 
 
-def test_every_command_and_option_is_documented() -> None:
-    text = read("docs/cli.md")
-    for name, parser in find_commands().items():
-        assert f"vkc-pin {name}" in parser.format_help()
-        section = text.split(f"## vkc-pin {name}")[1].split("\n## ")[0]
-        options = {option for action in parser._actions for option in action.option_strings}
+@pytest.mark.parametrize(
+    ("page", "parser", "heading"),
+    [
+        ("docs/cli.md", make_parser(), "vkc-pin "),
+        ("docs/benchmark_commands.md", commands.make_parser(), ""),
+    ],
+    ids=["vkc-pin", "benchmarks"],
+)
+def test_every_command_and_option_is_documented(
+    page: str, parser: argparse.ArgumentParser, heading: str
+) -> None:
+    text = read(page)
+    for name, command in find_commands(parser).items():
+        assert f"{heading}{name}" in command.format_help()
+        section = text.split(f"\n## {heading}{name}")[1].split("\n## ")[0]
+        options = {option for action in command._actions for option in action.option_strings}
         assert [one for one in options - {"-h", "--help"} if one not in section] == [], name
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_shell_commands_are_valid_and_do_not_share_folders(page: Path) -> None:
     """A folder belongs to one experiment."""
-    lines = {line for line in find_shell_lines(page) if line.startswith("vkc-pin")}
+    parsers = {"vkc-pin ": make_parser(), "python -m tests.benchmarks ": commands.make_parser()}
+    lines = {line for line in find_shell_lines(page) if line.startswith(tuple(parsers))}
     for line in lines:
-        words = line.partition("#")[0].split()[1:]
-        assert callable(make_parser().parse_args(words).run), line
-    experiments = [line for line in lines if re.match(r"vkc-pin (bench|generate)", line)]
+        program = next(program for program in parsers if line.startswith(program))
+        words = line.removeprefix(program).partition("#")[0].split()
+        assert callable(parsers[program].parse_args(words).run), line
+    experiments = [line for line in lines if re.match(r"vkc-pin (bench|generate)|python", line)]
     folders = re.findall(r"--out (?!DIR)(\S+)", "\n".join(experiments))
     assert len(folders) == len(set(folders))
 
@@ -282,11 +295,15 @@ def test_every_record_has_a_claim_and_the_command_that_reproduces_it() -> None:
     assert len(rows) == len(script["RECORDS"])
     files = (ROOT / "docs/results").iterdir()
     assert set(rows) == {file.name.removesuffix(".json.gz") for file in files}
-    benchmarks = [name for name, command in rows.items() if not command.startswith("python")]
-    commands = re.findall(r"`(vkc-pin bench [^`]+)`", read("docs/evidence.md"))[: len(benchmarks)]
-    for name, line in zip(benchmarks, commands, strict=True):
+    parsers = {"vkc-pin ": make_parser(), "python -m tests.benchmarks ": commands.make_parser()}
+    stated = re.findall(r"`((?:vkc-pin bench|python -m) [^`]+)`", read("docs/evidence.md"))
+    for name, line in zip(rows, stated, strict=True):
+        program = next((program for program in parsers if line.startswith(program)), None)
+        if program is None:
+            continue  # a command of its own
         meta = script["result"](name)["meta"]
-        arguments = vars(make_parser().parse_args(shlex.split(line)[1:]))
+        words = shlex.split(line.removeprefix(program))
+        arguments = vars(parsers[program].parse_args(words))
         assert line.endswith(f"out/{name}.json" if name.startswith("door") else f"out/{name}")
         assert arguments.get("seed") == meta.get("seed"), name
         for key in ("starts", "goals", "problems", "trials", "seeds"):

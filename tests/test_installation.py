@@ -15,10 +15,12 @@ from helpers.dependencies import SCRIPTS
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 EXTRAS = {
-    "": ["meshes", "plan"],
+    "": ["plan"],
     "cluster": ["distribute"],
+    "completion": ["complete"],
     "data": ["datasets"],
-    "import": ["imports"],
+    "experiments": ["baseline"],
+    "import": ["imports", "meshes"],
     "notebook": ["show"],
     "ros": ["record"],
     "sim": ["simulate"],

@@ -20,9 +20,9 @@ from helpers.datasets import SMALL
 
 import vkc_pin as vkc
 from vkc_pin import InputError
-from vkc_pin.benchmarks.harness.record import find_commit
-from vkc_pin.benchmarks.harness.runner import run
 from vkc_pin.cli import main
+from vkc_pin.experiments.harness.record import find_commit
+from vkc_pin.experiments.harness.runner import run
 from vkc_pin.procedural import random_object, write_object
 from vkc_pin.world.models.self_collisions import write_srdf
 

@@ -41,7 +41,7 @@ def test_dependencies_are_ranges(project: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize(
     ("extra", "script"),
-    [("", "meshes"), pytest.param("import", "imports", marks=pytest.mark.long)],
+    [("import", "meshes"), pytest.param("import", "imports", marks=pytest.mark.long)],
 )
 def test_declared_dependencies_suffice(extra: str, script: str, tmp_path: Path) -> None:
     """Optional dependencies of dependencies, such as trimesh's, are declared or not required."""
@@ -49,6 +49,30 @@ def test_declared_dependencies_suffice(extra: str, script: str, tmp_path: Path) 
     assert {"pytest", "sphinx"} & set(modules)
     assert "trimesh" not in modules
     run_without([*modules, "networkx"], SCRIPTS / f"{script}.py", tmp_path)
+
+
+def test_mesh_that_needs_an_extra_names_it(tmp_path: Path) -> None:
+    script = tmp_path / "load.py"
+    script.write_text(
+        "from pathlib import Path\n"
+        "from vkc_pin import InputError\n"
+        "from vkc_pin.world.files.meshes import load_mesh\n"
+        "text = '# Größe\\nv 0 0 0\\nv 1 0 0\\nv 1 1 0\\nv 0 1 0\\nf 1 2 3\\nf 1 3 4\\n'\n"
+        "Path('mesh.obj').write_text(text, encoding='utf-8')\n"
+        "assert len(load_mesh('mesh.obj').faces) == 2\n"
+        "Path('mesh.obj').write_text(text, encoding='latin-1')\n"
+        "concave = 'v 0 0 0\\nv 2 0 0\\nv 0.2 0.2 0\\nv 0 2 0\\nf 1 2 3 4\\n'\n"
+        "Path('concave.obj').write_text(concave, encoding='utf-8')\n"
+        "for name in ('mesh.obj', 'concave.obj'):\n"
+        "    try:\n"
+        "        load_mesh(name)\n"
+        "    except InputError as error:\n"
+        "        assert 'the extra `import`' in str(error), error\n"
+        "    else:\n"
+        "        raise AssertionError(name)\n",
+        encoding="utf-8",
+    )
+    run_without(find_undeclared(), script, tmp_path)
 
 
 def test_build_and_runtime_dependencies_have_the_same_ranges(project: dict[str, Any]) -> None:

@@ -1,9 +1,8 @@
 import types
 
 from . import (
-    baselines,
-    benchmarks,
     datasets,
+    experiments,
     importing,
     procedural,
     simulation,
@@ -80,13 +79,12 @@ __all__ = [
     "VirtualKinematicChain",
     "VkcError",
     "__version__",
-    "baselines",
-    "benchmarks",
     "build",
     "check_scene",
     "consolidate",
     "cpin",
     "datasets",
+    "experiments",
     "importing",
     "inverse_kinematics",
     "invert",

@@ -9,20 +9,12 @@ from typing import Any
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks import (
-    baselines,
-    bases,
-    chores,
-    execution,
-    gap,
-    household,
-    initialization,
-    scale,
-)
-from vkc_pin.benchmarks.peers import run as peers
-from vkc_pin.benchmarks.problems import ablation, first_seed, impossible, random_problems, spread
-from vkc_pin.benchmarks.robot_object_matrix import robots
-from vkc_pin.benchmarks.robot_object_matrix import run as matrix
+from tests.benchmarks import bases, gap, scale
+from tests.benchmarks.peers import run as peers
+from tests.benchmarks.problems import ablation, first_seed, impossible, random_problems, spread
+from tests.benchmarks.robot_object_matrix import robots
+from tests.benchmarks.robot_object_matrix import run as matrix
+from vkc_pin.experiments import chores, door_and_drawer, execution, household, initialization
 
 ONE, ONE_START = {"trials": 1, "seed": 0}, {"starts": 1, "seed": 0}
 WRONG: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
@@ -32,10 +24,14 @@ WRONG: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
     (ablation.run, {"tasks": ["dor"]}, "did you mean 'door'"),
     (ablation.run, {"tasks": ["door"], "problems": [1]}, "tasks"),
     (ablation.run, {"tasks": ["door"], "starts": 0}, "at least 1"),
-    (baselines.run, {**ONE, "tasks": ["drawers"]}, r"no task 'drawers'.*did you mean 'drawer'"),
-    (baselines.run, {**ONE, "methods": ["B3"]}, r"no method 'B3'.*B1"),
-    (baselines.run, {**ONE, "methods": []}, "methods: there is nothing to run"),
-    (baselines.run, {**ONE, "trials": 0}, r"trials: out of range.*at least 1.*got 0"),
+    (
+        door_and_drawer.run,
+        {**ONE, "tasks": ["drawers"]},
+        r"no task 'drawers'.*mean 'drawer'",
+    ),
+    (door_and_drawer.run, {**ONE, "methods": ["B3"]}, r"no method 'B3'.*B1"),
+    (door_and_drawer.run, {**ONE, "methods": []}, "methods: there is nothing to run"),
+    (door_and_drawer.run, {**ONE, "trials": 0}, r"trials: out of range.*at least 1.*got 0"),
     (bases.run, {"bases": ["diferential"]}, "did you mean 'differential'"),
     (bases.run, {"tasks": ["drawers"]}, "did you mean 'drawer'"),
     (bases.run, {"trials": 0}, "trials"),

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from helpers.moveit_problems import ROBOT, make_request, make_scene, write
 
-from vkc_pin.benchmarks import arms
-from vkc_pin.benchmarks.harness.record import describe_environment
-from vkc_pin.benchmarks.moveit_problems import list_problems, read_problem
+from tests.benchmarks import arms
+from vkc_pin.experiments.harness.record import describe_environment
+from vkc_pin.importing.moveit_problems import list_problems, read_problem
 
 ROOT = Path(__file__).parents[2]
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.experiments import run_experiment
+from helpers.experiments import run_benchmark
 
+from tests.benchmarks import bases
 from vkc_pin import InputError
-from vkc_pin.benchmarks import bases
-from vkc_pin.benchmarks.harness.record import describe_environment
+from vkc_pin.experiments.harness.record import describe_environment
 
 
 def test_starts_are_the_same_for_every_base() -> None:
@@ -38,7 +38,7 @@ def test_robots_of_one_name_are_rejected(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_both_bases_open_the_drawer(tmp_path: Path) -> None:
     arguments = "bases --trials 1 --tasks drawer --bases omni differential"
-    table, records = run_experiment(arguments, tmp_path)
+    table, records = run_benchmark(arguments, tmp_path)
     assert [(r["base"], r["success"]) for r in records] == [("differential", True), ("omni", True)]
     for r in records:
         assert f"| husky_ur5e | drawer | {r['base']} | 1 of 1 | {r['planning_time']:.3f} |" in table

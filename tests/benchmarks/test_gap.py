@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.experiments import run_experiment
+from helpers.experiments import run_benchmark
 
 import vkc_pin as vkc
+from tests.benchmarks import gap
+from tests.benchmarks.problems.poses import CLEAR, sample_random_start
 from vkc_pin import validate
-from vkc_pin.benchmarks import gap
-from vkc_pin.benchmarks.problems.poses import CLEAR, sample_random_start
 
 
 def test_starts_are_random_free_and_reproducible() -> None:
@@ -50,7 +50,7 @@ def test_robot_drives_through_the_gap_and_reaches_over_the_table() -> None:
 def test_trial_is_recorded_and_tabulated(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    table, (record,) = run_experiment("gap --trials 1", tmp_path)
+    table, (record,) = run_benchmark("gap --trials 1", tmp_path)
     assert table in capsys.readouterr().out
     assert record["success"] is True, record["violations"]
     assert record["first_seed"] is (record["solves"] == 1)

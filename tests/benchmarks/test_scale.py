@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.experiments import run_experiment
+from helpers.experiments import run_benchmark
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks import scale
-from vkc_pin.benchmarks.harness.record import describe_environment
-from vkc_pin.benchmarks.scale import make_crowded_scene, make_refined_options
+from tests.benchmarks import scale
+from tests.benchmarks.scale import make_crowded_scene, make_refined_options
+from vkc_pin.experiments.harness.record import describe_environment
 
 
 def test_larger_sets_of_obstacles_contain_the_smaller_ones() -> None:
@@ -45,7 +45,7 @@ def test_planning_times_are_tabulated_by_count(
     of: str, counts: tuple[int, int], tmp_path: Path
 ) -> None:
     arguments = f"scale --starts 1 --of {of} --counts {counts[1]} {counts[0]}"
-    table, trials = run_experiment(arguments, tmp_path)
+    table, trials = run_benchmark(arguments, tmp_path)
     assert [t[of] for t in trials] == list(counts)
     usual = scale.AXES[of].usual
     (reference,) = [t["planning_time"] for t in trials if t[of] == usual]

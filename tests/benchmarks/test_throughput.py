@@ -7,8 +7,8 @@ import pytest
 import yaml
 from helpers.datasets import SMALL
 
-from vkc_pin.benchmarks.throughput import WORKERS, Costs, measure_costs, run, simulate_workers
-from vkc_pin.cli import main
+from tests.benchmarks.commands import main
+from tests.benchmarks.throughput import WORKERS, Costs, measure_costs, run, simulate_workers
 from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.recipe import TASKS, load_recipe
 
@@ -66,7 +66,7 @@ pytest.importorskip("h5py")
 @pytest.mark.long
 def test_each_task_has_a_record(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recipe, out = write_recipe(tmp_path), tmp_path / "out"
-    command = f"bench throughput --episodes 2 --out {out} --recipe {recipe} --quiet"
+    command = f"throughput --episodes 2 --out {out} --recipe {recipe} --quiet"
     assert main(command.split()) == 0
     assert "drive-open" in capsys.readouterr().out
     result = json.loads((out / "results.json").read_text())

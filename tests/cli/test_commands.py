@@ -13,7 +13,7 @@ from helpers.commands import RunCommand
 from helpers.executions import plan_drawer
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks import door
+from vkc_pin.experiments import door
 from vkc_pin.world.files.resources import find_resource_folder
 
 TIMED_OUT = (

@@ -16,6 +16,7 @@ import numpy as np
 import pinocchio as pin
 
 import vkc_pin as vkc
+from vkc_pin.experiments.baselines import plan_separately
 from vkc_pin.planning.kinematics import (
     center_of_mass,
     frame_jacobian,
@@ -392,7 +393,7 @@ CALLS: dict[str, Call] = {
         2.0,
     ),
     "plan_separately": Call(
-        vkc.baselines.plan_separately,
+        plan_separately,
         lambda: {
             "scene": load_drawer_scene(),
             "steps": _make_steps(),

@@ -9,8 +9,8 @@ from typing import Any
 
 from oracle.judge import Verdict, judge
 
-from vkc_pin.baselines import separate
-from vkc_pin.benchmarks.peers import found as peers
+from tests.benchmarks.peers import found as peers
+from vkc_pin.experiments.baselines import separate
 from vkc_pin.planning import results, solve_task
 from vkc_pin.planning.plan import Plan
 

@@ -19,9 +19,10 @@ def main() -> None:
     ) as cluster:
         with urllib.request.urlopen(cluster.dashboard_link, timeout=60) as page:
             assert b"bokeh" in page.read().lower()
-        options = ["--starts", "1", "--counts", "10", "--scheduler", cluster.scheduler_address]
-        out = Path("scale").resolve()
-        subprocess.run([COMMAND, "bench", "scale", *options, "--out", out, "--quiet"], check=True)
+        options = ["--starts", "1", "--scenes", "init_1", "--methods", "auto"]
+        options += ["--scheduler", cluster.scheduler_address, "--quiet"]
+        out = Path("initialization").resolve()
+        subprocess.run([COMMAND, "bench", "initialization", *options, "--out", out], check=True)
     assert len(json.loads((out / "results.json").read_text(encoding="utf-8"))["trials"]) == 1
 
 

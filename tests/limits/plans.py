@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.problems.problem_set import NUMBER, TASKS, make_start, problem
+from tests.benchmarks.problems.problem_set import NUMBER, problem
+from vkc_pin.experiments.tasks import TASKS, make_start
 
 __all__ = ["export_plans"]
 

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.execution import TASKS
-from vkc_pin.benchmarks.harness.record import find_commit
-from vkc_pin.benchmarks.harness.tables import describe_run
-from vkc_pin.benchmarks.problems.problem_set import TASKS as ALL_TASKS
-from vkc_pin.benchmarks.problems.problem_set import make_start
+from vkc_pin.experiments.execution import TASKS
+from vkc_pin.experiments.harness.record import find_commit
+from vkc_pin.experiments.harness.tables import describe_run
+from vkc_pin.experiments.tasks import TASKS as ALL_TASKS
+from vkc_pin.experiments.tasks import make_start
 from vkc_pin.utils.system import describe_machine, find_versions, measure_peak_memory
 
 from .bound import compute_bound

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks import initialization
+from vkc_pin.experiments import initialization
 
 BASE = [-0.03, 0.09, -1.19]
 SCRIPT = "from test_determinism import *; print(compute_hash(plan_{}()))"

@@ -10,7 +10,7 @@ from helpers.small_problems import SHORT, make_all_pairs, make_program, sample_c
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin.benchmarks.scale import make_crowded_scene
+from tests.benchmarks.scale import make_crowded_scene
 from vkc_pin.planning.chain.collision_pairs import PhaseGeometry
 from vkc_pin.planning.chain.contacts import ContactModel
 from vkc_pin.planning.nlp.problem import TrajectoryProblem

@@ -27,8 +27,8 @@ from helpers.litter import BIN_POSITION, LITTER_POSITION, describe_shelf, make_l
 from helpers.small_problems import make_full_scene
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.initialization import TARGET
-from vkc_pin.benchmarks.robot_object_matrix.pairs import load_description, make_hall
+from tests.benchmarks.robot_object_matrix.pairs import load_description, make_hall
+from vkc_pin.experiments.initialization import TARGET
 from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.sequential import plan_each_step
 from vkc_pin.validation.validate import validate

@@ -15,7 +15,7 @@ from helpers.gates import make_gate_problem
 from helpers.small_problems import load_door_scene
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.problems.problem_set import problem as make_random_problem
+from tests.benchmarks.problems.problem_set import problem as make_random_problem
 from vkc_pin.planning.initialization.initial_guess import InitialGuess
 from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.results import complete_draft

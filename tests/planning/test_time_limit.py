@@ -10,8 +10,8 @@ import pytest
 from helpers.drawers import SHORT, load_drawer_scene
 
 import vkc_pin as vkc
-from vkc_pin.baselines import plan_separately
-from vkc_pin.benchmarks.chores import fetch
+from vkc_pin.experiments.baselines import plan_separately
+from vkc_pin.experiments.chores import fetch
 from vkc_pin.utils.budget import Budget
 
 PULL = [vkc.Actuate("drawer", {"slide": 0.3})]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.initialization import TARGET
+from vkc_pin.experiments.initialization import TARGET
 from vkc_pin.planning.initialization.initial_guess import InitialGuess, make_initial_guess
 from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.sequential import plan_each_step

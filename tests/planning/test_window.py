@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.initialization import TARGET
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.experiments.initialization import TARGET
 
 TABLE = (-3.0, 1.3, 1.051)  # on the bar table
 OPEN, SHUT = (

@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from vkc_pin.benchmarks.commands import add_bench
 from vkc_pin.cli.datasets import add_datasets
 from vkc_pin.cli.first_steps import add_completion, add_first_steps
 from vkc_pin.cli.importing import add_importing
@@ -32,6 +31,7 @@ from vkc_pin.cli.options import (
 )
 from vkc_pin.cli.steps import add_steps, make_steps
 from vkc_pin.errors import InputError, VkcError
+from vkc_pin.experiments.commands import add_bench
 from vkc_pin.world.files.writing import check_outputs, write_atomically
 from vkc_pin.world.trajectory.formats.rosbag import import_rosbags
 from vkc_pin.world.trajectory.formats.tables import GROUPS
@@ -277,7 +277,7 @@ def _srdf(arguments: argparse.Namespace) -> int:
 
 def make_parser() -> argparse.ArgumentParser:
     """Return the command line parser; each command sets `run`, a function of the arguments."""
-    from vkc_pin.benchmarks.harness.record import find_versions
+    from vkc_pin.utils.system import find_versions
 
     parser = CommandParser(
         prog="vkc-pin",
@@ -398,7 +398,7 @@ def _add_view_and_export(commands: Any) -> None:
 def run(argv: Sequence[str]) -> int:
     """Run one command and return its exit code."""
     arguments = make_parser().parse_args(argv)
-    arguments.given = list(argv)
+    arguments.command = ["vkc-pin", *argv]
     try:
         return int(arguments.run(arguments))
     except KeyboardInterrupt:

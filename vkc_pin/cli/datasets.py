@@ -6,7 +6,6 @@ import argparse
 import sys
 from typing import Any
 
-from vkc_pin.benchmarks.commands import report_interruption
 from vkc_pin.cli.options import (
     EXIT_FAILED,
     EXIT_OK,
@@ -16,6 +15,7 @@ from vkc_pin.cli.options import (
     parse_positive,
 )
 from vkc_pin.errors import InputError, VkcError
+from vkc_pin.utils.command_line import report_interruption
 from vkc_pin.utils.interrupt import raise_on_interrupt
 
 __all__ = ["add_datasets"]
@@ -76,7 +76,7 @@ def _generate(arguments: argparse.Namespace) -> int:
                 progress=not arguments.quiet,
             )
     except KeyboardInterrupt as stop:
-        return report_interruption(arguments.given, stop)
+        return report_interruption(arguments.command, stop)
     except VkcError as error:
         if isinstance(error, InputError):
             raise

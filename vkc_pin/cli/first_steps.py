@@ -13,6 +13,7 @@ from typing import Any
 
 from vkc_pin.cli.options import EXIT_FAILED, EXIT_OK, add_command, add_option
 from vkc_pin.errors import InputError
+from vkc_pin.utils.optional_imports import import_optional
 from vkc_pin.utils.system import has_screen
 from vkc_pin.world.files.resources import find_resource_folder
 from vkc_pin.world.files.writing import check_outputs, write_atomically
@@ -94,7 +95,6 @@ def _new(arguments: argparse.Namespace) -> int:
 def _complete(
     make_parser: Callable[[], argparse.ArgumentParser], arguments: argparse.Namespace
 ) -> int:
-    import shtab
-
+    shtab = import_optional("shtab", "completion", purpose="completion in shells")
     sys.stdout.write(f"{shtab.complete(make_parser(), shell=arguments.shell)}\n")
     return EXIT_OK

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from vkc_pin.benchmarks.commands import EXIT_INTERRUPTED, EXIT_OK, parse_natural, parse_positive
+from vkc_pin.utils.command_line import EXIT_INTERRUPTED, EXIT_OK, parse_natural, parse_positive
 
 __all__ = [
     "EXIT_FAILED",

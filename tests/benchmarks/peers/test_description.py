@@ -9,9 +9,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from vkc_pin.benchmarks.peers.description import FRAME, describe
-from vkc_pin.benchmarks.peers.sampled import compute_finite_limits
-from vkc_pin.benchmarks.peers.tasks import TASKS, build_program, make_problem, sample_goals
+from tests.benchmarks.peers.description import FRAME, describe
+from tests.benchmarks.peers.sampled import compute_finite_limits
+from tests.benchmarks.peers.tasks import TASKS, build_program, make_problem, sample_goals
 
 
 @pytest.mark.parametrize(

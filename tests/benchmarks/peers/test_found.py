@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vkc_pin.benchmarks.peers.found import validate_path
-from vkc_pin.benchmarks.peers.tasks import build_program, make_problem, sample_goals
+from tests.benchmarks.peers.found import validate_path
+from tests.benchmarks.peers.tasks import build_program, make_problem, sample_goals
 
 
 def test_path_through_a_wall_is_rejected() -> None:

@@ -7,9 +7,9 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from vkc_pin.benchmarks.peers.found import Clock, Peer, compute_clearances, validate_path
-from vkc_pin.benchmarks.peers.run import PEERS
-from vkc_pin.benchmarks.peers.tasks import build_program, make_problem
+from tests.benchmarks.peers.found import Clock, Peer, compute_clearances, validate_path
+from tests.benchmarks.peers.run import PEERS
+from tests.benchmarks.peers.tasks import build_program, make_problem
 
 
 def find_peer(name: str) -> Peer:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from helpers.experiments import run_experiment
+from helpers.experiments import run_benchmark
 
-from vkc_pin.benchmarks.harness.record import describe_environment
-from vkc_pin.benchmarks.peers.run import format_results
+from tests.benchmarks.peers.run import format_results
+from vkc_pin.experiments.harness.record import describe_environment
 
 
 def test_baseline_and_planner_solve_the_same_reach(tmp_path: Path) -> None:
     arguments = "peers --trials 1 --tasks reach --methods B1 VKC --seed 18"
-    table, trials = run_experiment(arguments, tmp_path)
+    table, trials = run_benchmark(arguments, tmp_path)
     assert [trial["method"] for trial in trials] == ["B1", "VKC"]
     for trial in trials:
         assert trial["success"] is True, trial["violations"]

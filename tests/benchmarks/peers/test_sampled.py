@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vkc_pin.benchmarks.peers.sampled import compute_finite_limits, subdivide
-from vkc_pin.benchmarks.peers.tasks import build_program, make_problem
+from tests.benchmarks.peers.sampled import compute_finite_limits, subdivide
+from tests.benchmarks.peers.tasks import build_program, make_problem
 
 
 def test_lines_are_subdivided() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vkc_pin.benchmarks.peers.tasks import TASKS, build_program, make_problem, sample_goals
+from tests.benchmarks.peers.tasks import TASKS, build_program, make_problem, sample_goals
 from vkc_pin.planning.initialization.keyframes import compute_shortfall
 
 

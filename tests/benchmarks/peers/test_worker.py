@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.benchmarks.peers import worker
+from tests.benchmarks.peers.processes import start_solver
 from vkc_pin import InputError
-from vkc_pin.benchmarks.peers import worker
-from vkc_pin.benchmarks.peers.processes import start_solver
 
 FILE = Path(worker.__file__)
 # Module, its package, and a word of the error about a missing description.

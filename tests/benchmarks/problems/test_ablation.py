@@ -6,17 +6,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.experiments import run_experiment
+from helpers.experiments import run_benchmark
 
-from vkc_pin.benchmarks.harness.record import describe_environment
-from vkc_pin.benchmarks.problems import ablation
+from tests.benchmarks.problems import ablation
+from vkc_pin.experiments.harness.record import describe_environment
 
 CHANGE = "solver.loop:PROGRESS=0.6"
 
 
 @pytest.mark.long
 def test_numbered_problems_are_planned_with_each_setting(tmp_path: Path) -> None:
-    table, trials = run_experiment(f"ablation --problems 42 9 --changes {CHANGE}", tmp_path)
+    table, trials = run_benchmark(f"ablation --problems 42 9 --changes {CHANGE}", tmp_path)
     assert [(r["number"], r["kind"], r["method"]) for r in trials] == [
         (number, kind, method)
         for number, kind in ((9, "reach"), (42, "scene"))
@@ -30,7 +30,7 @@ def test_numbered_problems_are_planned_with_each_setting(tmp_path: Path) -> None
 @pytest.mark.long
 def test_tasks_are_planned_from_random_starts_with_each_setting(tmp_path: Path) -> None:
     arguments = f"ablation --tasks drawer --starts 2 --seed 5 --changes {CHANGE}"
-    table, trials = run_experiment(arguments, tmp_path)
+    table, trials = run_benchmark(arguments, tmp_path)
     length = {(r["number"], r["method"]): r["base_path_length"] for r in trials}
     assert len(length) == len(trials) == 4
     assert length[0, CHANGE] != length[1, CHANGE]

@@ -7,7 +7,7 @@ import contextlib
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.problems.changes import UNCHANGED, Change, parse_change
+from tests.benchmarks.problems.changes import UNCHANGED, Change, parse_change
 from vkc_pin.planning.solver import loop, trust_region
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from helpers.experiments import run_experiment
+from helpers.experiments import run_benchmark
 
 
 @pytest.mark.long
 def test_first_guess_successes_are_counted(tmp_path: Path) -> None:
-    table, trials = run_experiment("first-seed --trials 1 --tasks drawer door", tmp_path)
+    table, trials = run_benchmark("first-seed --trials 1 --tasks drawer door", tmp_path)
     assert [r["task"] for r in trials] == ["door", "drawer"]
     for r in trials:
         assert r["first_seed"] is (r["success"] and r["solves"] == 1)

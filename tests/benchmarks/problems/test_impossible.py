@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.experiments import run_experiment
+from helpers.experiments import run_benchmark
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.problems.impossible import KINDS, sample_impossible_problem
+from tests.benchmarks.problems.impossible import KINDS, sample_impossible_problem
 
 
 @pytest.mark.parametrize(
@@ -31,7 +31,7 @@ def test_problems_are_determined_by_their_numbers() -> None:
 
 
 def test_trials_are_explained_and_proven_infeasible(tmp_path: Path) -> None:
-    table, trials = run_experiment("impossible --problems 4", tmp_path)
+    table, trials = run_benchmark("impossible --problems 4", tmp_path)
     kinds = ["closed wall", "fence round the start", "fence round the goal", "gap too narrow"]
     assert [t["kind"] for t in trials] == kinds
     for t in trials:

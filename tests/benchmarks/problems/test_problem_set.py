@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.problems.problem_set import get_kind, make_start, problem
+from tests.benchmarks.problems.problem_set import get_kind, problem
+from vkc_pin.experiments.tasks import make_start
 from vkc_pin.world.scene.scene import START_CLEARANCE
 from vkc_pin.world.task.compiler import compile_task
 

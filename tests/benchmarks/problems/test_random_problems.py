@@ -6,13 +6,13 @@ import json
 from pathlib import Path
 
 import pytest
-from helpers.experiments import run_experiment
+from helpers.experiments import run_benchmark
 from oracle.agreement import judge_all, record_violations, write_verdicts
 from oracle.plan import read_plan
 
+from tests.benchmarks.problems import random_problems
+from tests.benchmarks.problems.random_problems import sample_problem
 from vkc_pin import InputError, Plan
-from vkc_pin.benchmarks.problems import random_problems
-from vkc_pin.benchmarks.problems.random_problems import sample_problem
 from vkc_pin.procedural.tasks import random_task
 from vkc_pin.world.files.resources import list_resources
 from vkc_pin.world.task.steps import step_to_dict
@@ -44,7 +44,7 @@ def test_problems_have_all_scenes_obstacles_and_kinds_of_steps() -> None:
 
 @pytest.mark.long
 def test_plans_are_saved_and_judged(tmp_path: Path) -> None:
-    table, trials = run_experiment("random --problems 4", tmp_path)
+    table, trials = run_benchmark("random --problems 4", tmp_path)
     assert [trial["key"] for trial in trials] == ["00000", "00001", "00002", "00003"]
     successes = sum(trial["success"] for trial in trials)
     assert successes > 0
@@ -81,7 +81,7 @@ def test_plans_are_saved_and_judged(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_tasks_in_random_rooms_are_planned_and_saved(tmp_path: Path) -> None:
-    table, trials = run_experiment("random --of rooms --problems 2", tmp_path / "rooms")
+    table, trials = run_benchmark("random --of rooms --problems 2", tmp_path / "rooms")
     assert [trial["success"] for trial in trials] == [True, True]
     for trial in trials:
         room, steps = random_task(trial["number"])

@@ -5,14 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from helpers.experiments import run_experiment
+from helpers.experiments import run_benchmark
 
-from vkc_pin.benchmarks.problems import spread
+from tests.benchmarks.problems import spread
 
 
 @pytest.mark.long
 def test_problem_is_planned_with_each_seed(tmp_path: Path) -> None:
-    table, trials = run_experiment("spread --problems 9 --seeds 2 --seed 4", tmp_path)
+    table, trials = run_benchmark("spread --problems 9 --seeds 2 --seed 4", tmp_path)
     assert [(r["number"], r["seed"]) for r in trials] == [(9, 4), (9, 5)]
     successes = sum(r["success"] for r in trials)
     assert f"| 9 | {trials[0]['problem']} | {successes} of 2 |" in table

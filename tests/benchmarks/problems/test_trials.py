@@ -7,9 +7,9 @@ import dataclasses
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.problems import trials
-from vkc_pin.benchmarks.problems.changes import parse_change
-from vkc_pin.benchmarks.problems.problem_set import problem
+from tests.benchmarks.problems import trials
+from tests.benchmarks.problems.changes import parse_change
+from tests.benchmarks.problems.problem_set import problem
 
 
 @pytest.fixture(scope="module")

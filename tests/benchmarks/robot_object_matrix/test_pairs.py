@@ -10,7 +10,7 @@ import pytest
 from helpers.arm_urdf import write_arms
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.robot_object_matrix.pairs import (
+from tests.benchmarks.robot_object_matrix.pairs import (
     SHARE,
     Request,
     load_description,

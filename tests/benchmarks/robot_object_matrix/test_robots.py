@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.arm_urdf import write_arms
-from helpers.experiments import run_experiment
+from helpers.experiments import run_benchmark
 from helpers.wheels import format_wheel, write_wheeled_robot
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.harness.record import describe_environment
-from vkc_pin.benchmarks.robot_object_matrix.robots import (
+from tests.benchmarks.robot_object_matrix.robots import (
     format_results,
     sample_reachable_poses,
 )
+from vkc_pin.experiments.harness.record import describe_environment
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def test_command_records_reached_poses_and_a_failed_import(tmp_path: Path) -> No
     box = "<collision><geometry><box size='1 1 1'/></geometry></collision>"
     legless.write_text(f"<robot name='legless'><link name='a'>{box}</link></robot>")
     out = tmp_path / "out"
-    table, records = run_experiment(f"robots --goals 2 --robots {valid} {legless}", out)
+    table, records = run_benchmark(f"robots --goals 2 --robots {valid} {legless}", out)
     failures = [(r["robot"], r["status"]) for r in records if not r["success"]]
     assert failures == [("legless", "not imported")]
     reached = [r for r in records if r["robot"] == "robot"]
@@ -68,7 +68,7 @@ def test_robot_with_unsteered_wheels_does_not_slide(tmp_path: Path) -> None:
     wheels = (format_wheel("left_wheel", 0.0, 0.25), format_wheel("right_wheel", 0.0, -0.25))
     file = write_wheeled_robot(tmp_path / "rover", *wheels)
     out = tmp_path / "out"
-    table, records = run_experiment(f"robots --goals 1 --robots {file}", out)
+    table, records = run_benchmark(f"robots --goals 1 --robots {file}", out)
     assert [(r["base"], r["success"]) for r in records] == [("differential", True)]
     assert "| robot | differential | 5 |" in table
 

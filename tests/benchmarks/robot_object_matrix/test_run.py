@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.experiments import run_experiment
+from helpers.experiments import run_benchmark
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.harness.record import describe_environment
-from vkc_pin.benchmarks.robot_object_matrix.pairs import SHARE
-from vkc_pin.benchmarks.robot_object_matrix.run import chart, format_results
+from tests.benchmarks.robot_object_matrix.pairs import SHARE
+from tests.benchmarks.robot_object_matrix.run import chart, format_results
+from vkc_pin.experiments.harness.record import describe_environment
 
 
 def make_record(robot: str, name: str, status: str = "success", **fields: Any) -> dict[str, Any]:
@@ -78,7 +78,7 @@ def test_chart_shows_the_successes_of_all_pairs(tmp_path: Path) -> None:
 def test_command_opens_a_drawer(tmp_path: Path) -> None:
     drawers = vkc.load_object(vkc.procedural.random_object("drawers", 0))
     arguments = "anything --starts 1 --robots husky_ur5e --objects drawers_0"
-    table, (opened,) = run_experiment(arguments, tmp_path)
+    table, (opened,) = run_benchmark(arguments, tmp_path)
     assert "| drawers_0 | 1/1 |" in table
     assert "| husky_ur5e | omni | 1 | 1 |" in table
     assert opened["base"] == "omni"

@@ -14,7 +14,7 @@ from helpers.carrying import describe_box
 from helpers.expected_errors import expect_error
 
 import vkc_pin as vkc
-from vkc_pin.benchmarks.chores import CHORES
+from vkc_pin.experiments.chores import CHORES
 from vkc_pin.world.task.actions import compile_each_step
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.loads import check_footings, check_loads

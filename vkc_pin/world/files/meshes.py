@@ -29,6 +29,7 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.utils.arrays import MAX_COORDINATE, Floats, Ints
 from vkc_pin.utils.disk_cache import load_or_build
 from vkc_pin.utils.interrupt import defer_interrupt
+from vkc_pin.utils.optional_imports import import_optional
 from vkc_pin.world.files.collada import read_collada
 from vkc_pin.world.files.gltf import GLTF_SUFFIXES, GLTF_TO_Z_UP, check_gltf
 from vkc_pin.world.files.hulls import SHEET_THICKNESS, compute_hull, compute_outer_hull, thicken
@@ -106,6 +107,10 @@ def load_mesh(
     try:
         mesh = _read_mesh(file, submesh)
     except InputError:
+        raise
+    except ModuleNotFoundError as error:
+        purpose = "a mesh file with text that is not UTF-8"  # trimesh guesses its encoding
+        import_optional(error.name or "", "import", purpose=purpose, file=file)
         raise
     except Exception as error:  # readers raise any type
         expected = "an OBJ, STL, PLY, OFF, glTF or COLLADA file"

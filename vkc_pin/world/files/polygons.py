@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import mapbox_earcut
 import numpy as np
 
 from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.utils.optional_imports import import_optional
 
 __all__ = ["triangulate_polygon", "triangulate_polygons"]
 
@@ -53,7 +53,8 @@ def triangulate_polygon(vertices: Floats, rings: Sequence[Ints]) -> Ints:
     plane = [(largest + 1) % 3, (largest + 2) % 3]
     flat = np.ascontiguousarray(vertices[used][:, plane], float)
     ends = np.cumsum([len(ring) for ring in rings]).astype(np.uint32)
-    chosen = mapbox_earcut.triangulate_float64(flat, ends).reshape(-1, 3).astype(np.int64)
+    earcut = import_optional("mapbox_earcut", "import", purpose="a mesh of concave polygons")
+    chosen = earcut.triangulate_float64(flat, ends).reshape(-1, 3).astype(np.int64)
     areas = _compute_area_vectors(vertices[used[chosen]])
     is_inverted = areas @ normal < 0.0
     chosen[is_inverted] = chosen[is_inverted][:, ::-1]

@@ -1,0 +1,1 @@
+"""Measures planning: benchmarks for developers."""

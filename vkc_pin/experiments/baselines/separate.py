@@ -1,0 +1,191 @@
+"""Plans base and arm one after the other: the baselines B1 and B2 of the paper.
+
+After section IV-C of Jiao et al. (IROS 2021) and its authors' code. A step that moves joints of an
+object has five stages:
+
+1. Find base poses from which the arm reaches the handle, the nearest first (`find_base_poses`).
+2. Drive there with the arm as it is: A*, then optimisation.
+3. Reach the handle with a stationary base: optimisation.
+4. Find base poses from which the arm reaches the handle's final pose, and a path of the base.
+5. Move the object's joints to their goals and the base along its path; the arm follows
+   (`following`): B1 by inverse kinematics, B2 moving arm and object out of collision at each
+   waypoint.
+
+`Place` continues after 3 by base poses from which the arm can put the object down, lifting it (or
+moving it home, see `postures`), driving, and putting it down. `Reach` is 1 to 3 with a pose in
+place of the handle. `GoTo` drives as in 2, after withdrawing the arm if necessary. In these B1 and
+B2 are equal.
+
+After a failed stage the next base poses are tried, then everything with other random numbers.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections import Counter
+from collections.abc import Sequence
+from typing import cast
+
+from vkc_pin.errors import InputError, format_value
+from vkc_pin.experiments.baselines.attempt import FINER, Attempt, BaselineStep
+from vkc_pin.experiments.baselines.following import import_solvers
+from vkc_pin.options import Options
+from vkc_pin.planning.plan import Plan, PlanningStatistics
+from vkc_pin.planning.planner import Planner, acquire_cache
+from vkc_pin.planning.request import check_arguments, make_budget
+from vkc_pin.planning.results import retime_validated
+from vkc_pin.utils.arguments import check_choice, check_integer
+from vkc_pin.utils.budget import reserve_time
+from vkc_pin.validation.report import Report
+from vkc_pin.validation.validate import validate
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.compiler import compile_task
+from vkc_pin.world.task.steps import Step
+from vkc_pin.world.trajectory.formats.archives import PlanStatus
+from vkc_pin.world.trajectory.trajectory import Trajectory
+
+__all__ = ["BASELINES", "RETRIES", "plan_separately"]
+
+BASELINES = ("B1", "B2")
+RETRIES = 5
+"""Number of attempts."""
+LARGEST_FINER = 16
+
+
+def plan_separately(
+    scene: Scene,
+    steps: Sequence[Step],
+    *,
+    method: str = "B1",
+    options: Options | None = None,
+    seed: int = 0,
+    time_limit: float | None = None,
+    max_evaluations: int | None = None,
+    retries: int = RETRIES,
+    finer: int = FINER,
+    planner: Planner | None = None,
+) -> Plan:
+    """Plan by a baseline.
+
+    Args:
+        scene: Robot, objects and obstacles.
+        steps: Any number of `Actuate`, `Place`, `GoTo` and `Reach`.
+        method: "B1" or "B2".
+        options: As for `planner.plan`.
+        seed: Random seed.
+        time_limit: As for `planner.plan`.
+        max_evaluations: As for `planner.plan`; an iteration of inverse kinematics counts 1.
+        retries: Number of attempts, with other random numbers, until a motion is valid.
+        finer: Factor of `Options.move_waypoints` for moving objects.
+        planner: As for `planner.plan`.
+
+    Returns:
+        The plan of the first valid attempt, else of the one with most progress. Its status is then
+        the cause: "no base pose", "no base path", "arm does not reach", "no inverse kinematics",
+        "collision", "too fast", "closure" or "rejected"; "time limit", "evaluation limit" or
+        "interrupted" if not all attempts were made. `rounds` is the number of attempts.
+
+    Raises:
+        InputError: A step is impossible or of another kind, an argument is invalid, or the extra
+            `experiments` is not installed.
+    """
+    import_solvers()
+    options = Options() if options is None else options
+    budget = make_budget(time_limit, max_evaluations)
+    check_arguments(scene, options, seed)
+    check_choice(method, BASELINES, "method", "method")
+    check_integer(retries, "retries", low=1)
+    check_integer(finer, "finer", low=1, high=LARGEST_FINER)
+    task = compile_task(scene, steps, options)
+    actions: list[BaselineStep] = []
+    for number, step in enumerate(task.steps):
+        if not isinstance(step, BaselineStep):
+            expected = "Actuate, Place, GoTo or Reach"
+            raise InputError(
+                "the baselines know no such step",
+                field=f"steps[{number}]",
+                expected=expected,
+                got=format_value(step),
+            )
+        actions.append(step)
+    with acquire_cache(planner) as cache, budget.activate():
+        began, times, iterations, before = time.perf_counter(), Counter[str](), 0, cache.build_time
+        best: tuple[float, PlanStatus, int, Trajectory, Report] | None = None
+        for number in range(retries):
+            attempt = Attempt(
+                scene,
+                options,
+                refine=method == "B2",
+                seed=[int(seed), number],
+                finer=finer,
+                cache=cache,
+            )
+            trajectory, progress, cause = attempt.run(actions)
+            before_checks, checked = attempt.times["validation"], time.perf_counter()
+            trajectory, report = _retime(
+                scene, task.steps, trajectory, options, attempt.times, failed=cause != ""
+            )
+            took = time.perf_counter() - checked
+            reserve_time("validation", took)
+            attempt.times["retiming"] += took - (attempt.times["validation"] - before_checks)
+            status = "success" if report.ok else cast("PlanStatus", cause or "rejected")
+            iterations += attempt.iterations
+            times.update(attempt.times)
+            if best is None or status == "success" or progress > best[0]:
+                best = progress, status, number, trajectory, report
+            ended = budget.stop_status
+            if status == "success" or ended:
+                break
+        built = cache.build_time - before
+    assert best is not None
+    _, status, tried, trajectory, report = best
+    if ended and status not in ("success", ended):
+        status, notes = (
+            ended,
+            (*report.notes, f"the attempt with most progress failed with: {status}"),
+        )
+        report = dataclasses.replace(report, notes=notes)
+    statistics = PlanningStatistics(
+        planning_time=time.perf_counter() - began - built,
+        build_time=built,
+        iterations=iterations,
+        rounds=number + 1,
+        evaluations=budget.evaluations,
+    ).with_times(times)
+    name = f"{method}, try {tried + 1}"
+    return Plan(
+        scene,
+        task.steps,
+        options,
+        trajectory,
+        report,
+        status,
+        statistics=statistics,
+        seed=int(seed),
+        initialization=name,
+    )
+
+
+def _retime(
+    scene: Scene,
+    steps: Sequence[Step],
+    trajectory: Trajectory,
+    options: Options,
+    times: dict[str, float],
+    *,
+    failed: bool,
+) -> tuple[Trajectory, Report]:
+    """Return the motion as `plan` retimes it, or with its own times if only that is valid."""
+
+    def check(motion: Trajectory) -> Report:
+        began = time.perf_counter()
+        report = validate(scene, steps, motion, options)
+        times["validation"] += time.perf_counter() - began
+        return report
+
+    if not failed:
+        timed, report = retime_validated(scene, trajectory, check, jerk_time=options.jerk_time)
+        if report.ok:
+            return timed, report
+    return trajectory, check(trajectory)

@@ -1,0 +1,360 @@
+"""Plans chores of many steps in one call, or step by step."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import time
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Unpack
+
+import numpy as np
+
+from vkc_pin.experiments.harness import runner
+from vkc_pin.experiments.harness import step_by_step as stepwise
+from vkc_pin.experiments.harness.record import Record, Solve, distribution, trial, values
+from vkc_pin.experiments.harness.runner import LIMITS, Execution
+from vkc_pin.experiments.harness.tables import (
+    JUDGED,
+    count,
+    count_failures,
+    format_decimal,
+    format_medians,
+    format_table,
+    join_sections,
+    select,
+)
+from vkc_pin.options import Options
+from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.planner import plan
+from vkc_pin.procedural.rooms.clutter import add_clutter
+from vkc_pin.world.scene.scene import Scene, load_scene
+from vkc_pin.world.task.steps import Actuate, Grasp, Place, Step
+
+__all__ = [
+    "CHORES",
+    "Chore",
+    "fetch",
+    "format_results",
+    "home",
+    "make_cluttered_home",
+    "plan_trial",
+    "run",
+]
+
+WINDOW = 2
+ONE_CALL, STEP_BY_STEP = "VKC", "step by step"
+THINGS = 300  # in the cluttered home
+_AROUND = 0.2  # [m] around the task's objects that stays free of clutter
+_LIMITS = {
+    **LIMITS,
+    "max_evaluations": 4 * LIMITS["max_evaluations"],
+}  # eighteen steps take half a million units and more
+
+_METHODS = {ONE_CALL: "in one call", STEP_BY_STEP: "step by step"}
+_SEEDS_ABOUT = (
+    "Spread is the largest value of the successes over the least, minus 1; ± is half their range "
+    "over its middle. Step by step, "
+    "each begins where the motion of the one before ends, and nothing comes after the first that "
+    "fails."
+)
+
+BAR_TABLE = (-3.0, 1.3, 1.051)  # [m], where the cup stands in between
+DESK = (1.75, 3.5, 0.741)
+CLEAR = (1.1, -2.9, 0.036)  # floor before the television
+BIN = (3.0, -3.6, 0.16)  # within its walls; released objects would fall
+BEFORE_TABLE = (-0.9, 2.2, 0.036)  # floor before the low table
+SHELF = (-4.61, -1.0, 0.846)
+
+
+def home(scene: Scene) -> list[Step]:
+    """Return the 18 steps of the scene `household`: a cup to the desk, and litter to the bin."""
+    return [
+        Grasp("refrigerator"),
+        Actuate("refrigerator", {"hinge": 1.57}),
+        Grasp("cold_cup"),
+        Place("cold_cup", BAR_TABLE),
+        Grasp("refrigerator"),
+        Actuate("refrigerator", {"hinge": 0.0}),
+        Grasp("door", "handle_free"),
+        Actuate("door", {"hinge": 1.52}),
+        Grasp("cold_cup"),
+        Place("cold_cup", DESK),
+        Grasp("door", "handle_free"),
+        Actuate("door", {"hinge": 0.0}),
+        Grasp("broom"),
+        Grasp("litter", "pull", by="broom.bristles"),
+        Place("litter", CLEAR),
+        Place("broom", scene.objects["broom"].placement.translation),
+        Grasp("litter", "grip"),
+        Place("litter", BIN, unsupported=True),
+    ]
+
+
+def fetch(scene: Scene) -> list[Step]:
+    """Return the 10 steps of the scene `fetch`: a ball from under a table into a cabinet."""
+    return [
+        Grasp("stick"),
+        Grasp("ball", "pull", by="stick.tip"),
+        Place("ball", BEFORE_TABLE),
+        Place("stick", scene.objects["stick"].placement.translation),
+        Grasp("cabinet"),
+        Actuate("cabinet", {"hinge": 1.57}),
+        Grasp("ball", "grip"),
+        Place("ball", SHELF),
+        Grasp("cabinet"),
+        Actuate("cabinet", {"hinge": 0.0}),
+    ]
+
+
+def _box(name: str, *sides: tuple[float, float], colour: str = "white") -> dict[str, Any]:
+    """Return a box obstacle, given by its range along x, y and z [m]."""
+    size, middle = (
+        [round(high - low, 4) for low, high in sides],
+        [round((low + high) / 2.0, 5) for low, high in sides],
+    )
+    return {"name": name, "type": "box", "size": size, "position": middle, "colour": colour}
+
+
+TIGHT: tuple[dict[str, Any], ...] = (
+    # The narrow door's leaf stands 50 mm in the wall above it, and 20 mm in that beside its hinge,
+    # wherever it is.
+    _box("casing_above", (1.105, 2.01), (1.2, 1.3), (1.945, 2.07), colour="wall"),
+    _box("casing_beside", (1.105, 1.22), (1.2, 1.3), (0.0, 2.07), colour="wall"),
+    # The refrigerator's door touches the panel on its hinge's side, and is 9 mm from that beside
+    # the kitchen.
+    _box("panel_east", (-1.255, -1.235), (3.354, 4.0), (0.0, 2.1)),
+    _box("panel_west", (-1.889, -1.859), (3.3, 4.0), (0.0, 2.1)),
+    # 10 mm from the narrow door's levers: a bag that hangs from its frame, and a wardrobe, once the
+    # door is open as far as asked.
+    _box("bag", (1.875, 1.985), (1.11, 1.19), (0.8, 1.04), colour="teal"),
+    _box("wardrobe", (0.2, 1.099), (1.3, 1.9), (0.0, 2.0), colour="oak"),
+    # 10 mm from carried objects: a bottle behind the cup in the refrigerator, a mop between broom
+    # and wall.
+    {
+        "name": "bottle",
+        "type": "cylinder",
+        "radius": 0.035,
+        "length": 0.25,
+        "position": [-1.55, 3.64, 1.105],
+        "colour": "green",
+    },
+    {
+        "name": "mop",
+        "type": "cylinder",
+        "radius": 0.0125,
+        "length": 1.0,
+        "position": [2.4, -3.935, 0.62],
+        "colour": "blue",
+    },
+)
+"""Obstacles that make the home as narrow as real ones."""
+
+
+@functools.cache
+def make_cluttered_home() -> Scene:
+    """Return the scene `household` with `TIGHT` and 300 more objects: 561 convex shapes."""
+    home, places = load_scene("household"), (BAR_TABLE, DESK, CLEAR, BIN)
+    with warnings.catch_warnings(
+        action="ignore", category=UserWarning
+    ):  # of leaves in their walls, which are meant
+        tight = Scene.from_document(
+            {**home.document, "obstacles": [*home.document["obstacles"], *TIGHT]}, home.folder
+        )
+        return add_clutter(tight, THINGS, clear=[(place, _AROUND) for place in places])
+
+
+@dataclass(frozen=True)
+class Chore:
+    """A chore: its scene, steps and options."""
+
+    scene: Callable[[], Scene]
+    steps: Callable[[Scene], list[Step]]
+    options: Options = field(default_factory=Options)
+
+    def list_steps(self) -> list[Step]:
+        """Return the steps."""
+        return self.steps(self.scene())
+
+
+CHORES = {
+    "home": Chore(functools.partial(load_scene, "household"), home),
+    "fetch": Chore(functools.partial(load_scene, "fetch"), fetch),
+    "cluttered": Chore(make_cluttered_home, home, Options(dist_safe=0.005)),
+}
+"""By name."""
+
+
+def plan_trial(scene: Scene, spec: Mapping[str, Any]) -> Plan:
+    """Plan the chore of one trial."""
+    chore = CHORES[spec["scene"]]
+    return plan(
+        scene,
+        chore.steps(scene),
+        window=WINDOW,
+        options=chore.options,
+        seed=spec["seed"],
+        **_LIMITS,
+    )
+
+
+def run(
+    *,
+    trials: int,
+    seed: int,
+    out: str | Path,
+    chores: Sequence[str] = tuple(CHORES),
+    seeds: int = 1,
+    step_by_step: bool = False,
+    solve: Solve = plan_trial,
+    **execution: Unpack[Execution],
+) -> dict[str, Any]:
+    """Run the experiment in the folder `out`; see `runner.run`.
+
+    Args:
+        out: Folder.
+        trials: Number of starts per chore; the first is that of the scene, the others are random.
+        seed: Random seed of starts, and the first one of planning.
+        chores: Some of `CHORES`.
+        seeds: Number of planning seeds per start.
+        step_by_step: Whether to plan the steps one by one as well.
+        solve: Plans a trial in one call.
+    """
+    chores, specs = runner.select_names("chore", chores, CHORES), list[dict[str, Any]]()
+    methods = (ONE_CALL, *((STEP_BY_STEP,) if step_by_step else ()))
+    for chore in chores:
+        scene = CHORES[chore].scene()
+        rng = np.random.default_rng([seed, list(CHORES).index(chore)])
+        for number in range(trials):
+            base = (scene.sample_start(rng) if number else scene).start[:3].tolist()
+            for own, method in itertools.product(range(seed, seed + seeds), methods):
+                key = f"{chore}/{number:04d}/{own:04d}/{method}"
+                specs.append(
+                    {
+                        "key": key,
+                        "scene": chore,
+                        "number": number,
+                        "base": base,
+                        "seed": own,
+                        "method": method,
+                    }
+                )
+    settings = {
+        "benchmark": "chores",
+        "seed": seed,
+        "starts": trials,
+        "seeds": seeds,
+        "methods": methods,
+        "chores": chores,
+    }
+    settings |= {
+        "window": WINDOW,
+        **_LIMITS,
+        "steps": {name: list(map(str, CHORES[name].list_steps())) for name in chores},
+    }
+    settings |= {"dist_safe": {name: CHORES[name].options.dist_safe for name in chores}}
+    return runner.run(
+        specs,
+        functools.partial(_record, solve=solve),
+        out,
+        settings=settings,
+        format_results=format_results,
+        **execution,
+    )
+
+
+def format_results(result: Mapping[str, Any]) -> str:
+    """Return the tables of a result in Markdown."""
+    about, records, rows = result["meta"], result["trials"], []
+    seeds, methods = about.get("seeds", 1), about.get("methods", [ONE_CALL])
+    for chore in about["chores"]:
+        own = select(records, scene=chore, method=ONE_CALL)
+        late = format_decimal(distribution(own, "planning_time")[1])
+        lengths = format_medians(
+            select(own, success=True), "base_path_length", "arm_path_length", "duration"
+        )
+        steps, times = (
+            str(len(about["steps"][chore])),
+            format_medians(own, "wall_time", "planning_time"),
+        )
+        rows.append([chore, steps, count(own), *times, late, *lengths, count_failures(own)])
+    times_head = ["in all, median [s]", "planning, median [s]", "95th percentile [s]"]
+    lengths_head = ["base [m]", "arm [rad]", "duration [s]", "failures"]
+    fields = ("wall_time", "planning_time", "base_path_length", "arm_path_length")
+    every = []
+    for r in records:
+        cells = [r["scene"], str(r["number"]), str(r["seed"]), _METHODS[r["method"]], r["status"]]
+        every.append([*cells, *(format_decimal(r.get(field) or float("nan")) for field in fields)])
+    head = ["chore", "start", "seed", "planned", "status", "in all [s]", "planning [s]"]
+    parts = [
+        "# Chores",
+        f"Each chore in one call, from {about['starts']} starts, the first of them the scene's "
+        f"own, with {seeds} seeds each from {about['seed']} on; a window of {about['window']} "
+        f"actions. {JUDGED} The time in all includes building symbolic programs; path lengths "
+        "and durations are medians of successes.",
+        format_table(["chore", "steps", "success", *times_head, *lengths_head], rows),
+    ]
+    if seeds > 1 or len(methods) > 1:
+        parts += ["## Seeds", _SEEDS_ABOUT, _seeds_table(result)]
+    parts += ["## Every trial", format_table([*head, "base [m]", "arm [rad]"], every, text=5)]
+    return join_sections(about, *parts)
+
+
+def _seeds_table(result: Mapping[str, Any]) -> str:
+    """Tabulate the dependence on the planning seed by chore, start and method."""
+    groups = dict[tuple[str, int, str], list[Record]]()
+    for record in result["trials"]:
+        groups.setdefault((record["scene"], record["number"], record["method"]), []).append(record)
+    rows = []
+    for (chore, number, method), own in groups.items():
+        steps, times = len(result["meta"]["steps"][chore]), values(own, "cpu_time")
+        counts = ["all" if n == steps else f"{n:.0f}" for n in values(own, "steps_done")]
+        spreads = list[str]()
+        for length in ("base_path_length", "arm_path_length"):
+            found = values(select(own, success=True), length)
+            spreads += _format_spread(min(found), max(found)) if found else ["–"] * 3
+        cpu = (
+            (format_decimal(float(np.median(times))), format_decimal(max(times)))
+            if times
+            else ("–", "–")
+        )
+        done = ", ".join(counts) or "–"
+        rows.append([chore, str(number), _METHODS[method], count(own), done, *cpu, *spreads])
+    head = ["chore", "start", "planned", "success", "steps done", "CPU, median [s]", "most [s]"]
+    head += ["base [m]", "spread [%]", "±[%]", "arm [rad]", "spread [%]", "±[%]"]
+    return format_table(head, rows, text=3)
+
+
+def _format_spread(low: float, high: float) -> list[str]:
+    """Return a range, its spread over the lower end, and half of it over the middle [%]."""
+    shares = (high / low - 1.0, (high - low) / (high + low)) if low > 0.0 else (np.nan, np.nan)
+    return [
+        f"{low:.1f}–{high:.1f}",
+        *("–" if np.isnan(share) else f"{100.0 * share:.0f}" for share in shares),
+    ]
+
+
+def _record(spec: dict[str, Any], solve: Solve) -> dict[str, Any]:
+    chore = CHORES[spec["scene"]]
+    scene = chore.scene().with_start(base=spec["base"])
+    steps = chore.steps(scene)
+    began, before = time.perf_counter(), time.process_time()
+    about = {"method": spec["method"], "seed": spec["seed"]}
+    more: dict[str, Any] = {"number": spec["number"]}
+    if spec["method"] == STEP_BY_STEP:
+        plans = stepwise.plan_step_by_step(scene, steps, options=chore.options, seed=spec["seed"])
+        more |= {"wall_time": time.perf_counter() - began, "cpu_time": time.process_time() - before}
+        return {
+            **stepwise.combine_records(plans, len(steps), **about, **more),
+            "scene": spec["scene"],
+        }
+    plan = solve(scene, spec)
+    more |= {"wall_time": time.perf_counter() - began, "cpu_time": time.process_time() - before}
+    more |= {
+        "duration": plan.trajectory.metrics()["duration"],
+        "steps_done": len(steps) if plan.success else None,
+    }
+    return {**trial(plan, **about, **more), "scene": spec["scene"]}

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.interpolate import CubicHermiteSpline
 
 import vkc_pin as vkc
+from vkc_pin.planning.retiming.cubic_path import CubicPath
 from vkc_pin.planning.retiming.limits import Limits, limit_jerk
 from vkc_pin.planning.retiming.spline_path import fit_path
 from vkc_pin.planning.retiming.topp_ra import compute_speeds
@@ -55,7 +55,7 @@ def test_curves_are_slowed_down_to_their_limits(
     assert limits.slow_down(curve).times[-1] == pytest.approx(factor, rel=1e-8)
 
 
-def make_path(points: np.ndarray, jerk: float) -> tuple[CubicHermiteSpline, Curve, Limits]:
+def make_path(points: np.ndarray, jerk: float) -> tuple[CubicPath, Curve, Limits]:
     """Return a path through points, the fastest pace along it, and the limits."""
     wide = np.full(points.shape[1], 10.0)
     limits = Limits(-wide, wide, 0.1 * wide, 0.2 * wide, np.full(len(wide), jerk))

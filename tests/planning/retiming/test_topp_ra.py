@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.interpolate import CubicHermiteSpline
 
+from vkc_pin.planning.retiming.cubic_path import CubicPath
 from vkc_pin.planning.retiming.spline_path import fit_path
 from vkc_pin.planning.retiming.topp_ra import compute_speeds
 
 FREE = (np.full(2, -np.inf), np.full(2, np.inf))
 
 
-def make_line(length: float) -> CubicHermiteSpline:
+def make_line(length: float) -> CubicPath:
     """Return a straight path along the first of two coordinates."""
     return fit_path(np.array([[0.0, 0.0], [length, 0.0]]), np.ones(2), FREE)
 
@@ -66,19 +66,21 @@ def test_no_speeds_without_limits() -> None:
     assert compute_speeds(make_line(1.0), np.array([0.0, 1.0]), unlimited, unlimited) is None
 
 
-@pytest.mark.long
-def test_matplotlib_is_not_imported() -> None:
-    """The import takes half a second and serves only the plots of toppra, which still work."""
+def test_neither_matplotlib_nor_splines_are_imported() -> None:
+    """The imports take half a second and serve plots and splines of toppra, which still work."""
     code = """
 import sys, numpy as np
 from vkc_pin.planning.retiming.spline_path import fit_path
 from vkc_pin.planning.retiming.topp_ra import compute_speeds
 path = fit_path(np.array([[0.0], [1.0]]), np.ones(1), (-np.ones(1), np.ones(1)))
 assert compute_speeds(path, path.x, np.ones(1), np.ones(1)) is not None
-assert not [name for name in sys.modules if name.startswith("matplotlib")]
+unused = ("matplotlib", "scipy.interpolate", "scipy.sparse")
+assert not [name for name in sys.modules if name.startswith(unused)]
 from toppra.algorithm.algorithm import plt
 import matplotlib.pyplot
 assert plt.figure is matplotlib.pyplot.figure
+from toppra import SplineInterpolator
+assert SplineInterpolator([0.0, 1.0, 2.0], [[0.0], [1.0], [4.0]])(1.5).shape == (1,)
 """
     subprocess.run([sys.executable, "-c", code], timeout=60, check=True)
 

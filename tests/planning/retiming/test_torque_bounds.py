@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from helpers.door_closers import load_door_with_closer
 from helpers.executions import plan_door
-from scipy.interpolate import CubicHermiteSpline
 
+from vkc_pin.planning.retiming.cubic_path import CubicPath
 from vkc_pin.planning.retiming.torque_bounds import TorqueBounds
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.torques import Torques
@@ -28,7 +28,7 @@ def test_linearized_torques_equal_torques(speed: float, change: float) -> None:
     torques, bounds, curve = make_opening(
         damping=200.0, friction=4.0, stiffness=5.0, springref=-2.0
     )
-    path = CubicHermiteSpline(curve.times - curve.times[0], curve.positions, curve.rates)
+    path = CubicPath(curve.times - curve.times[0], curve.positions, curve.rates)
     places = np.linspace(path.x[2], path.x[-3], 5)
     push, square, rest = bounds.linearize(path, path.x, np.full(len(path.x), speed), places)
     tangents, bends = path(places, 1), path(places, 2)

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from vkc_pin.planning.retiming.cubic_path import CubicPath
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.articulated_object import ArticulatedObject
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.curve import Curve, sample_intervals
 from vkc_pin.world.trajectory.wheels import RollingLimits
-
-if TYPE_CHECKING:
-    from scipy.interpolate import CubicHermiteSpline
 
 __all__ = ["Limits", "limit_jerk"]
 
@@ -94,7 +92,7 @@ class Limits(NamedTuple):
         return Curve(curve.times * factor, curve.positions, curve.rates / factor)
 
 
-def limit_jerk(path: CubicHermiteSpline, pace: Curve, steps: int, limits: Limits) -> Curve:
+def limit_jerk(path: CubicPath, pace: Curve, steps: int, limits: Limits) -> Curve:
     """Return a curve along a path with limited jerk, and zero acceleration at both ends.
 
     The progress along the path is replaced by its moving average, which is smoother by one order.
@@ -116,7 +114,7 @@ def limit_jerk(path: CubicHermiteSpline, pace: Curve, steps: int, limits: Limits
     return min(candidates, key=lambda curve: float(curve.times[-1]))
 
 
-def _average_pace(path: CubicHermiteSpline, pace: Curve, steps: int, span: float) -> Curve:
+def _average_pace(path: CubicPath, pace: Curve, steps: int, span: float) -> Curve:
     """Return the curve for an averaging interval `span` [s], before it is slowed down."""
     from scipy.interpolate import CubicHermiteSpline as Hermite
     from scipy.interpolate import make_interp_spline

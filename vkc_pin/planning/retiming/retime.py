@@ -6,11 +6,11 @@ import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vkc_pin.planning.base_paths.arcs import interpolate_arcs
+from vkc_pin.planning.retiming.cubic_path import CubicPath
 from vkc_pin.planning.retiming.limits import Limits, limit_jerk
 from vkc_pin.planning.retiming.spline_path import fit_path
 from vkc_pin.planning.retiming.topp_ra import compute_speeds
@@ -22,9 +22,6 @@ from vkc_pin.world.trajectory.curve import MIN_INTERVAL, Curve, concatenate_curv
 from vkc_pin.world.trajectory.torques import Torques
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.wheels import RollingLimits, make_rolling_limits
-
-if TYPE_CHECKING:
-    from scipy.interpolate import CubicHermiteSpline
 
 __all__ = ["Close", "retime_trajectory"]
 
@@ -201,7 +198,7 @@ def _follow_rolling_paths(
 
 
 def _retime_path(
-    path: CubicHermiteSpline, points: Floats, limits: Limits, torque_bounds: TorqueBounds | None
+    path: CubicPath, points: Floats, limits: Limits, torque_bounds: TorqueBounds | None
 ) -> tuple[Curve, Ints] | None:
     """Return a curve along a path through waypoints, (m, n), and the waypoints' knots, or None.
 
@@ -233,7 +230,7 @@ def _retime_path(
 
 
 def _follow_at_speeds(
-    path: CubicHermiteSpline, places: Floats, points: Floats, speeds: Floats, limits: Limits
+    path: CubicPath, places: Floats, points: Floats, speeds: Floats, limits: Limits
 ) -> tuple[Curve, Ints]:
     """Return the curve along a path at given speeds, and the waypoints' knots."""
     times = np.concatenate([[0.0], np.cumsum(2.0 * np.diff(places) / (speeds[1:] + speeds[:-1]))])
@@ -241,7 +238,7 @@ def _follow_at_speeds(
 
 
 def _follow_at_pace(
-    path: CubicHermiteSpline, pace: Curve, points: Floats, limits: Limits
+    path: CubicPath, pace: Curve, points: Floats, limits: Limits
 ) -> tuple[Curve, Ints]:
     """Return the curve along a path at a pace, or slower, and the knots of the waypoints."""
     if limits.has_unlimited_jerk:
@@ -256,7 +253,7 @@ def _follow_at_pace(
 
 
 def _follow_step(
-    path: CubicHermiteSpline,
+    path: CubicPath,
     points: Floats,
     limits: Limits,
     torque_bounds: TorqueBounds | None,

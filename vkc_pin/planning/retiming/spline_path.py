@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from vkc_pin.planning.retiming.cubic_path import CubicPath, compute_natural_slopes
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.trajectory.curve import Curve
-
-if TYPE_CHECKING:
-    from scipy.interpolate import CubicHermiteSpline
 
 __all__ = ["fit_path"]
 
 
-def fit_path(points: Floats, scale: Floats, limits: tuple[Floats, Floats]) -> CubicHermiteSpline:
+def fit_path(points: Floats, scale: Floats, limits: tuple[Floats, Floats]) -> CubicPath:
     """Return a cubic spline through waypoints, parametrised by the length of the polyline.
 
     It is twice differentiable and linear in the waypoints, so that linear constraints that hold at
@@ -29,25 +25,23 @@ def fit_path(points: Floats, scale: Floats, limits: tuple[Floats, Floats]) -> Cu
         scale: Weight of each coordinate in the length, shape (n,).
         limits: Lower and upper limits, shape (n,) each.
     """
-    from scipy.interpolate import CubicHermiteSpline, CubicSpline
-
     lengths = np.linalg.norm(np.diff(points, axis=0) * scale, axis=1)
     arc_lengths = np.concatenate([[0.0], np.cumsum(lengths)])
     steps = np.diff(points, axis=0)
     chords = steps / lengths[:, None]
     slopes = (
-        CubicSpline(arc_lengths, points, bc_type="natural")(arc_lengths, 1)
+        compute_natural_slopes(arc_lengths, points)
         if len(points) > 2
         else np.repeat(chords, 2, axis=0)
     )
     if not _exceeds_limits(points, slopes, lengths, limits):
-        return CubicHermiteSpline(arc_lengths, points, slopes)
+        return CubicPath(arc_lengths, points, slopes)
     before, after = np.vstack([chords[:1], chords]), np.vstack([chords, chords[-1:]])
     directions, steepest = np.sign(after), 3.0 * np.minimum(np.abs(before), np.abs(after))
     monotone = np.where(
         before * after > 0.0, directions * np.clip(directions * slopes, 0.0, steepest), 0.0
     )
-    return CubicHermiteSpline(arc_lengths, points, monotone)
+    return CubicPath(arc_lengths, points, monotone)
 
 
 def _exceeds_limits(

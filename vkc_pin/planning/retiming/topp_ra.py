@@ -9,14 +9,12 @@ from collections.abc import Callable
 from functools import cache
 from importlib import import_module
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from vkc_pin.planning.retiming.cubic_path import CubicPath
 from vkc_pin.utils.arrays import Floats, Ints
-
-if TYPE_CHECKING:
-    from scipy.interpolate import CubicHermiteSpline
 
 __all__ = ["compute_speeds"]
 
@@ -24,10 +22,12 @@ __all__ = ["compute_speeds"]
 # length; the second one is tried if the first fails.
 _KNOT_OFFSETS = (1e-3, 1e-2)
 _MAX_SPEED = 1e8  # of paths that no velocity limits
+# Modules that `toppra` imports and that are not used here
+_UNUSED = ("matplotlib", "matplotlib.pyplot", "scipy.interpolate", "scipy.sparse")
 
 
 def compute_speeds(
-    path: CubicHermiteSpline,
+    path: CubicPath,
     positions: Floats,
     velocity: Floats,
     acceleration: Floats,
@@ -70,9 +70,11 @@ def compute_speeds(
 
 @cache
 def _import_toppra() -> None:
-    """Import `toppra` with placeholders of matplotlib, whose import takes longer than a plan."""
-    names = [name for name in ("matplotlib", "matplotlib.pyplot") if name not in sys.modules]
-    placeholders = {name: _Placeholder(name) for name in names}
+    """Import `toppra` without modules whose import takes as long as a plan.
+
+    Its classes for splines, plots and other solvers, which are not used here, would need them.
+    """
+    placeholders = {name: _Placeholder(name) for name in _UNUSED if name not in sys.modules}
     if "matplotlib" in placeholders:
         placeholders["matplotlib"].__dict__["pyplot"] = placeholders["matplotlib.pyplot"]
     sys.modules |= placeholders
@@ -91,9 +93,15 @@ class _Placeholder(ModuleType):
     """Module that imports the real one when it is used."""
 
     def __getattr__(self, name: str) -> Any:
-        if sys.modules.get(self.__name__) is self:
+        if sys.modules.get(self.__name__) is not self:
+            return getattr(import_module(self.__name__), name)
+        if name.startswith("__"):
             raise AttributeError(name)
-        return getattr(import_module(self.__name__), name)
+
+        def call(*arguments: Any, **settings: Any) -> Any:
+            return getattr(import_module(self.__name__), name)(*arguments, **settings)
+
+        return call
 
 
 def _replace_knots(knots: Floats, positions: Floats, offset: float) -> Floats:
@@ -103,7 +111,7 @@ def _replace_knots(knots: Floats, positions: Floats, offset: float) -> Floats:
     return np.sort(np.concatenate([np.setdiff1d(positions, inside), inside - gaps, inside + gaps]))
 
 
-def _to_toppra_path(path: CubicHermiteSpline, columns: Ints) -> Any:
+def _to_toppra_path(path: CubicPath, columns: Ints) -> Any:
     """Return some coordinates of a path as a geometric path of `toppra`."""
     from toppra.interpolator import AbstractGeometricPath
 

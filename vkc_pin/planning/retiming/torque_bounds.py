@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from vkc_pin.planning.retiming.cubic_path import CubicPath
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.torques import Torques, sample_curve
-
-if TYPE_CHECKING:
-    from scipy.interpolate import CubicHermiteSpline
 
 __all__ = ["PathTorques", "TorqueBounds"]
 
@@ -80,7 +78,7 @@ class TorqueBounds:
         return torques[:, self._limited] / self._torques.torque_limits.limits[self._limited]
 
     def linearize(
-        self, path: CubicHermiteSpline, speed_positions: Floats, speeds: Floats, positions: Floats
+        self, path: CubicPath, speed_positions: Floats, speeds: Floats, positions: Floats
     ) -> tuple[Floats, Floats, Floats]:
         """Return the coefficients of `PathTorques.linearize` at positions of a path, shape (K,).
 
@@ -91,7 +89,7 @@ class TorqueBounds:
             self._rows[key] = self._evaluate_along_path(path, positions)
         return self._rows[key].linearize(np.sqrt(np.interp(positions, speed_positions, speeds**2)))
 
-    def _evaluate_along_path(self, path: CubicHermiteSpline, positions: Floats) -> PathTorques:
+    def _evaluate_along_path(self, path: CubicPath, positions: Floats) -> PathTorques:
         n_pieces, size = len(path.x) - 1, len(self._torques.trajectory.names)
         pieces = np.clip(np.searchsorted(path.x, positions, side="right") - 1, 0, n_pieces - 1)
         points, tangents, curvatures = (path(positions, order)[:, :size] for order in range(3))

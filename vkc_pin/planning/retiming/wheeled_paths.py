@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vkc_pin.planning.retiming.cubic_path import CubicPath
 from vkc_pin.planning.retiming.spline_path import fit_path
 from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.world.trajectory.curve import Curve, sample_intervals
 from vkc_pin.world.trajectory.wheels import RollingLimits, rotate_into_base_frame
-
-if TYPE_CHECKING:
-    from scipy.interpolate import CubicHermiteSpline
 
 __all__ = ["compute_slip", "fit_rolling_paths"]
 
@@ -38,7 +35,7 @@ def fit_rolling_paths(
     limits: tuple[Floats, Floats],
     rolling: RollingLimits,
     refinement: int = 1,
-) -> list[tuple[CubicHermiteSpline, Floats]]:
+) -> list[tuple[CubicPath, Floats]]:
     """Return paths through waypoints on which a base rolls, one from each stop to the next.
 
     The distance driven ℓ, the heading θ and all other coordinates are cubic between waypoints; the
@@ -108,10 +105,8 @@ def _fit_without_stops(
     limits: tuple[Floats, Floats],
     rolling: RollingLimits,
     refinement: int,
-) -> tuple[CubicHermiteSpline, Bools]:
+) -> tuple[CubicPath, Bools]:
     """Return a path without stops, see `fit_rolling_paths`, and a mask of infeasible steps."""
-    from scipy.interpolate import CubicHermiteSpline
-
     along, _, turn = rolling.compute_steps(points)
     distance = np.concatenate([[0.0], np.cumsum(along / np.sinc(turn / (2 * np.pi)))])
     # it reverses only where its driving direction changes
@@ -137,7 +132,7 @@ def _fit_without_stops(
     rates = np.column_stack(
         [slopes, path(at, 1)[:, 3:-1], wheels[1][:, None] + half * slopes[:, 2:]]
     )
-    return CubicHermiteSpline(at, values, rates), (np.abs(gaps) > _MAX_GAP) | tight
+    return CubicPath(at, values, rates), (np.abs(gaps) > _MAX_GAP) | tight
 
 
 def _compute_curvatures(turns: Floats, distances: Floats, radius: float) -> Floats:

@@ -6,7 +6,6 @@ import contextlib
 import signal
 import threading
 from collections.abc import Callable, Iterator
-from multiprocessing import resource_tracker
 from types import FrameType
 from typing import Any
 
@@ -53,6 +52,8 @@ def start_without_interrupt() -> Iterator[None]:
     They inherit the mask of blocked signals. Ignoring the signal would lose Ctrl-C here as well,
     and a handler is not inherited.
     """
+    from multiprocessing import resource_tracker
+
     with defer_interrupt():
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:

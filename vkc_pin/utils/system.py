@@ -9,7 +9,6 @@ import platform
 import resource
 import socket
 import sys
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +100,8 @@ def limit_resource(name: str, limit: int) -> None:
 
 def find_versions() -> dict[str, str]:
     """Return the versions of `PACKAGES`."""
+    from importlib.metadata import PackageNotFoundError, version  # takes as long as a scene
+
     found = {}
     for package in PACKAGES:
         try:

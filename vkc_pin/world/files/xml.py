@@ -7,7 +7,6 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
-from xml.sax.saxutils import quoteattr
 
 from vkc_pin.errors import InputError
 from vkc_pin.world.files.documents import read_text
@@ -115,4 +114,6 @@ def replace_forbidden(text: str) -> str:
 
 def quote(text: str) -> str:
     """Quote text as the value of an XML attribute, without forbidden characters."""
+    from xml.sax.saxutils import quoteattr  # imports urllib and http
+
     return quoteattr(replace_forbidden(text))

@@ -176,6 +176,7 @@ def test_unreadable_files_are_reported(tmp_path: Path, name: str) -> None:
     [
         (lambda about: about.pop("scene"), "scene"),
         (lambda about: about.pop("status"), "status"),
+        (lambda about: about.update(status="<b>"), "status"),
         (lambda about: about.update(steps=3), "steps: wrong value"),
         (lambda about: about["steps"][0].update(step="Actuat"), "did you mean 'Actuate'"),
         (lambda about: about["options"].update(dt=-1.0), "Options.dt"),

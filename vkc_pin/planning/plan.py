@@ -22,7 +22,6 @@ from vkc_pin.world.task.actions import compile_each_step
 from vkc_pin.world.task.steps import Step, step_from_dict, step_to_dict
 from vkc_pin.world.task.terms import Term, term_from_dict, term_to_dict
 from vkc_pin.world.trajectory.formats.archives import (
-    PlanStatus,
     read_archive,
     resolve_folder,
     serialize_folder,
@@ -133,7 +132,7 @@ class Plan:
         trajectory: The trajectory; after a failure, the best one found.
         report: Report of the independent validation.
         status: "success", "infeasible", "not converged", "time limit", "evaluation limit",
-            "interrupted", "rejected"; of baselines that fail, the stage.
+            "interrupted", "rejected"; of other planners that fail, a word of theirs.
         statistics: Times and counts of planning.
         seed: Random seed.
         initialization: Name of the initial guess it came from.
@@ -152,7 +151,7 @@ class Plan:
     options: Options
     trajectory: Trajectory
     report: Report
-    status: PlanStatus
+    status: str
     statistics: PlanningStatistics = field(default_factory=PlanningStatistics)
     seed: int = 0
     initialization: str = ""

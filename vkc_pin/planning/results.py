@@ -19,7 +19,6 @@ from vkc_pin.world.scene.contact_rules import compute_start_opening
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Step
 from vkc_pin.world.task.terms import Term
-from vkc_pin.world.trajectory.formats.archives import PlanStatus
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.splicing import concatenate_trajectories
 from vkc_pin.world.trajectory.trajectory import Trajectory
@@ -89,7 +88,7 @@ def concatenate_plans(
     if parts:
         request.progress.set_activity("checking all of it")
         failure = "rejected" if parts[-1].success else parts[-1].status
-        status: PlanStatus = current_ending() or failure
+        status: str = current_ending() or failure
         trajectory = concatenate_trajectories(
             [part.trajectory for part in parts], pause=request.options.grasp_time
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from vkc_pin.planning.results import make_stationary_trajectory, retime_validate
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
-from vkc_pin.world.trajectory.formats.archives import PlanStatus
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
@@ -118,7 +117,7 @@ def validate_path(
         problem.options,
         trajectory,
         report,
-        cast("PlanStatus", said),  # a failed peer's own word
+        said,  # a failed peer's own word
         statistics=PlanningStatistics(),
         seed=seed,
         initialization=name,

@@ -7,7 +7,7 @@ import functools
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Unpack, cast
+from typing import Any, Unpack
 
 from vkc_pin.experiments.baselines.separate import BASELINES, plan_separately
 from vkc_pin.experiments.harness import runner
@@ -27,7 +27,6 @@ from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.optional_imports import import_optional
-from vkc_pin.world.trajectory.formats.archives import PlanStatus
 
 from .constraint_graph import plan_by_constraint_graph
 from .found import (
@@ -224,7 +223,7 @@ def plan_by_peer(
         accept(found.path)
     said = judgements[0]
     late = not said.success and found.status == "timed out"  # its path may not be a motion
-    status = cast("PlanStatus", found.status)
+    status = found.status
     return dataclasses.replace(said, status=status) if late else said, found
 
 

@@ -25,7 +25,6 @@ import dataclasses
 import time
 from collections import Counter
 from collections.abc import Sequence
-from typing import cast
 
 from vkc_pin.errors import InputError, format_value
 from vkc_pin.experiments.baselines.attempt import FINER, Attempt, BaselineStep
@@ -42,7 +41,6 @@ from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Step
-from vkc_pin.world.trajectory.formats.archives import PlanStatus
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 __all__ = ["BASELINES", "RETRIES", "plan_separately"]
@@ -111,7 +109,7 @@ def plan_separately(
         actions.append(step)
     with acquire_cache(planner) as cache, budget.activate():
         began, times, iterations, before = time.perf_counter(), Counter[str](), 0, cache.build_time
-        best: tuple[float, PlanStatus, int, Trajectory, Report] | None = None
+        best: tuple[float, str, int, Trajectory, Report] | None = None
         for number in range(retries):
             attempt = Attempt(
                 scene,
@@ -129,7 +127,7 @@ def plan_separately(
             took = time.perf_counter() - checked
             reserve_time("validation", took)
             attempt.times["retiming"] += took - (attempt.times["validation"] - before_checks)
-            status = "success" if report.ok else cast("PlanStatus", cause or "rejected")
+            status = "success" if report.ok else cause or "rejected"
             iterations += attempt.iterations
             times.update(attempt.times)
             if best is None or status == "success" or progress > best[0]:

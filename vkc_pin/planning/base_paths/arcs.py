@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from vkc_pin.planning.base_paths import reeds_shepp
-from vkc_pin.planning.base_paths.motion_primitives import wrap_angle
 from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.world.models.coordinates import wrap_angle
 
 __all__ = ["Curves", "find_nearest_arc", "interpolate_arcs", "sample_path"]
 

@@ -10,8 +10,9 @@ import numpy as np
 
 from vkc_pin.planning.base_paths.grid import BaseGrid
 from vkc_pin.planning.base_paths.lattice_search import find_cheapest_path
-from vkc_pin.planning.base_paths.motion_primitives import Drive, SearchSpace, wrap_angle
+from vkc_pin.planning.base_paths.motion_primitives import Drive, SearchSpace
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.models.coordinates import wrap_angle
 
 __all__ = ["BasePath", "sample_poses", "shortest_path"]
 

@@ -21,11 +21,11 @@ from vkc_pin.planning.base_paths.motion_primitives import (
     Connections,
     Drive,
     SearchSpace,
-    wrap_angle,
 )
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.utils.budget import record_evaluations
 from vkc_pin.utils.optional_imports import import_compiled
+from vkc_pin.world.models.coordinates import wrap_angle
 
 __all__ = ["find_cheapest_path"]
 

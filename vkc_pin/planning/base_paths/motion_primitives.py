@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from vkc_pin.planning.base_paths.grid import BaseGrid
 from vkc_pin.utils.arrays import Bools, Floats, Ints
+from vkc_pin.world.models.coordinates import wrap_angle
 
-__all__ = ["BACKWARDS", "SIDEWAYS", "UNIT", "Connections", "Drive", "SearchSpace", "wrap_angle"]
+__all__ = ["BACKWARDS", "SIDEWAYS", "UNIT", "Connections", "Drive", "SearchSpace"]
 
 BACKWARDS = 1.2
 """Cost of a metre driven backwards [m]."""
@@ -252,8 +252,3 @@ class SearchSpace:
     def center(self, cell: int) -> Floats:
         """Return the centre of a cell, given as i·cells + j, shape (2,) [m]."""
         return np.array(self.grid.center(*divmod(int(cell), self.grid.cells)))
-
-
-def wrap_angle(angle: Any) -> Any:
-    """Wrap an angle, or an array of angles, to [-π, π)."""
-    return (angle + np.pi) % (2 * np.pi) - np.pi

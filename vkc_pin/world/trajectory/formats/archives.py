@@ -10,7 +10,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, get_args
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import (
@@ -40,7 +40,6 @@ from vkc_pin.world.files.writing import write_atomically
 __all__ = [
     "FORMAT",
     "METRICS",
-    "STATUSES",
     "MotionSchema",
     "PlanStatus",
     "ReportSchema",
@@ -65,16 +64,9 @@ PlanStatus = Literal[
     "evaluation limit",
     "interrupted",
     "rejected",
-    "no base pose",
-    "no base path",
-    "arm does not reach",
-    "no inverse kinematics",
-    "collision",
-    "too fast",
-    "closure",
 ]
-STATUSES: tuple[PlanStatus, ...] = get_args(PlanStatus)
-"""Statuses of plans; the last seven are stages in which a baseline failed."""
+"""How planning ended. Other planners have words of their own, see `Plan.status`."""
+_STATUS = r"^[a-z][a-z ]{0,39}$"
 METRICS = (
     "planning_time",
     "build_time",
@@ -219,7 +211,7 @@ class _About(Schema):
     options: dict[str, Any]
     trajectory: MotionSchema
     validation: ReportSchema
-    status: PlanStatus
+    status: Annotated[str, Field(strict=True, pattern=_STATUS)]
     metrics: _Metrics  # type: ignore[valid-type]
     seed: Count
     initialization: Text

@@ -31,13 +31,11 @@ class _ShortRepr(reprlib.Repr):
 
 
 _SHORT_REPR = _ShortRepr()
-(
-    _SHORT_REPR.maxlevel,
-    _SHORT_REPR.maxtuple,
-    _SHORT_REPR.maxlist,
-    _SHORT_REPR.maxdict,
-    _SHORT_REPR.maxset,
-) = 5, 12, 12, 8, 8
+_SHORT_REPR.maxlevel = 5
+_SHORT_REPR.maxtuple = 12
+_SHORT_REPR.maxlist = 12
+_SHORT_REPR.maxdict = 8
+_SHORT_REPR.maxset = 8
 _SHORT_REPR.maxstring = _SHORT_REPR.maxother = 200
 
 

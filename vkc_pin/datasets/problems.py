@@ -73,9 +73,8 @@ def find_grasping_start(
         The scene, or None if no configuration was found.
     """
     name, attachment = step.object, str(step.attachment)
-    holding = scene.with_held(
-        {name: attachment}
-    )  # wherever the hand is: the chain does not depend on it
+    # Wherever the hand is: the chain does not depend on it.
+    holding = scene.with_held({name: attachment})
     with planner.acquire() as cache:
         problem = TrajectoryProblem(
             holding,
@@ -100,9 +99,8 @@ def find_grasping_start(
                 chain.lower[freedoms], chain.upper[freedoms], (_BATCH, len(freedoms))
             )
             z, _ = search.sample(z, 1, "scatter")
-            z[:, search.object_columns] = problem.start[
-                search.object_columns
-            ]  # as it is at the start, not a step later
+            # The object is as at the start, not a step later.
+            z[:, search.object_columns] = problem.start[search.object_columns]
             limits = np.array([problem.limits(name) for name in chain.names]).T
             lower, upper = (np.tile(limit, (_BATCH, 1)) for limit in limits)
             fixed = [*freedoms, *search.object_columns.tolist()]
@@ -180,9 +178,9 @@ def sample_problem(
         robot = place.scene.robot.name
     else:
         rooms = fields.rooms.count or block + 1
-        entry = fields.robots[
-            (block + block // rooms) % len(fields.robots)
-        ]  # robots alternate, with an offset after each pass over the rooms
+        # Robots alternate, with an offset after each pass over the rooms.
+        turn = block + block // rooms
+        entry = fields.robots[turn % len(fields.robots)]
         place = _make_place(
             recipe_json,
             fields.rooms.first + block % rooms,

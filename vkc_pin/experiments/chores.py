@@ -49,10 +49,8 @@ WINDOW = 2
 ONE_CALL, STEP_BY_STEP = "VKC", "step by step"
 THINGS = 300  # in the cluttered home
 _AROUND = 0.2  # [m] around the task's objects that stays free of clutter
-_LIMITS = {
-    **LIMITS,
-    "max_evaluations": 4 * LIMITS["max_evaluations"],
-}  # eighteen steps take half a million units and more
+# Eighteen steps take half a million evaluations and more.
+_LIMITS = {**LIMITS, "max_evaluations": 4 * LIMITS["max_evaluations"]}
 
 _METHODS = {ONE_CALL: "in one call", STEP_BY_STEP: "step by step"}
 _SEEDS_ABOUT = (
@@ -112,10 +110,8 @@ def fetch(scene: Scene) -> list[Step]:
 
 def _box(name: str, *sides: tuple[float, float], colour: str = "white") -> dict[str, Any]:
     """Return a box obstacle, given by its range along x, y and z [m]."""
-    size, middle = (
-        [round(high - low, 4) for low, high in sides],
-        [round((low + high) / 2.0, 5) for low, high in sides],
-    )
+    size = [round(high - low, 4) for low, high in sides]
+    middle = [round((low + high) / 2.0, 5) for low, high in sides]
     return {"name": name, "type": "box", "size": size, "position": middle, "colour": colour}
 
 
@@ -158,9 +154,8 @@ TIGHT: tuple[dict[str, Any], ...] = (
 def make_cluttered_home() -> Scene:
     """Return the scene `household` with `TIGHT` and 300 more objects: 561 convex shapes."""
     home, places = load_scene("household"), (BAR_TABLE, DESK, CLEAR, BIN)
-    with warnings.catch_warnings(
-        action="ignore", category=UserWarning
-    ):  # of leaves in their walls, which are meant
+    # Leaves overlap their walls, which is meant.
+    with warnings.catch_warnings(action="ignore", category=UserWarning):
         tight = Scene.from_document(
             {**home.document, "obstacles": [*home.document["obstacles"], *TIGHT]}, home.folder
         )
@@ -276,10 +271,8 @@ def format_results(result: Mapping[str, Any]) -> str:
         lengths = format_medians(
             select(own, success=True), "base_path_length", "arm_path_length", "duration"
         )
-        steps, times = (
-            str(len(about["steps"][chore])),
-            format_medians(own, "wall_time", "planning_time"),
-        )
+        steps = str(len(about["steps"][chore]))
+        times = format_medians(own, "wall_time", "planning_time")
         rows.append([chore, steps, count(own), *times, late, *lengths, count_failures(own)])
     times_head = ["in all, median [s]", "planning, median [s]", "95th percentile [s]"]
     lengths_head = ["base [m]", "arm [rad]", "duration [s]", "failures"]

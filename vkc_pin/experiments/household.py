@@ -37,10 +37,8 @@ _EDGE = 0.05  # [m] from the cup's axis, whose radius is 0.035, to the plate's e
 def sample_cup_pose(scene: Scene, rng: np.random.Generator) -> dict[str, list[float]]:
     """Sample the pose of the cup on the coffee table, at any heading."""
     x, y = (float(rng.uniform(low + _EDGE, high - _EDGE)) for low, high in TABLE_TOP)
-    height, yaw = (
-        float(scene.objects["cup"].placement.translation[2]),
-        float(rng.uniform(-np.pi, np.pi)),
-    )
+    height = float(scene.objects["cup"].placement.translation[2])
+    yaw = float(rng.uniform(-np.pi, np.pi))
     return {"cup": [x, y, height, 0.0, 0.0, yaw]}
 
 

@@ -36,11 +36,9 @@ _ARROW = 0.06  # [m] length of their arrows
 _FACET = 0.05  # [m] approximate edge length of drawn triangles
 _OPEN = 0.35  # opening of the drawn joint, relative to how far it opens
 _LIGHT = np.array([0.35, -0.5, 0.8]) / np.linalg.norm([0.35, -0.5, 0.8])
-_STATIC_COLOUR, _MOVING_COLOUR, _HELD_COLOUR = (
-    np.array([0.83, 0.83, 0.81]),
-    np.array([0.93, 0.80, 0.62]),
-    np.array([0.82, 0.29, 0.36]),
-)
+_STATIC_COLOUR = np.array([0.83, 0.83, 0.81])
+_MOVING_COLOUR = np.array([0.93, 0.80, 0.62])
+_HELD_COLOUR = np.array([0.82, 0.29, 0.36])
 _SHORT, _LONG = 0.08, 0.25  # [m] lengths of the tool's axes in the close-up and beside the robot
 _AXES = (("x closes", "#d1282e"), ("y", "#2a9d4f"), ("z approaches", "#2f6db5"))
 _TOUCH_COLOUR = np.array([0.93, 0.72, 0.45])

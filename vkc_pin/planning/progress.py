@@ -105,9 +105,9 @@ def _screen() -> Callable[[str, bool], None] | None:
     if in_notebook():
         return _Line(sys.stdout, None)
     if sys.stderr is not None and sys.stderr.isatty():
-        return _Line(
-            sys.stderr, shutil.get_terminal_size().columns - 1
-        )  # a longer one would go over two lines, and stay
+        # A longer line would go over two lines, and stay.
+        width = shutil.get_terminal_size().columns - 1
+        return _Line(sys.stderr, width)
     return None
 
 
@@ -120,9 +120,8 @@ class _Line:
 
     def __call__(self, text: str, last: bool) -> None:
         if self.bar is None:
-            from tqdm import (
-                tqdm,
-            )  # not tqdm.auto, which has no words in a notebook without ipywidgets but a warning
+            # Not tqdm.auto, which has no words in a notebook without ipywidgets but a warning.
+            from tqdm import tqdm
 
             # Asked for its size, a terminal that has none, as some do, would be shown nothing.
             self.bar = tqdm(file=self.stream, bar_format="{desc}", ncols=self.width or 80, nrows=20)

@@ -93,9 +93,8 @@ def _list_joint_steps(name: str, placed: PlacedObject, share: float) -> list[Ste
     item, attachments_of = placed.object, dict[str, list[Attachment]]()
     for attachment in item.attachments.values():
         joint = _find_first_joint(item, attachment)
-        if (
-            joint is not None and attachment.contact == "grasp"
-        ):  # pushes move a joint in one direction only
+        # Pushes move a joint in one direction only.
+        if joint is not None and attachment.contact == "grasp":
             attachments_of.setdefault(joint, []).append(attachment)
     steps: list[Step] = []
     for joint, attachments in attachments_of.items():

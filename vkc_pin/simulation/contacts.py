@@ -108,16 +108,12 @@ def find_contact_pairs(world: World, holds: Iterable[Hold]) -> Pairs:
     excluded[deep] = True
     never = {named[k] for k in np.flatnonzero(excluded).tolist()}
     types, affinities = np.zeros((2, len(labels)), int)
-    bits, groups, held_pairs = (
-        dict[Hold, int](),
-        dict[tuple[frozenset[str], str], int](),
-        set[frozenset[str]](),
-    )
+    bits = dict[Hold, int]()
+    groups = dict[tuple[frozenset[str], str], int]()
+    held_pairs = set[frozenset[str]]()
     for hold in holds:
-        hands, link = (
-            frozenset(find_touch_links(world.scene, hold)),
-            find_grasped_link(world.scene, hold),
-        )
+        hands = frozenset(find_touch_links(world.scene, hold))
+        link = find_grasped_link(world.scene, hold)
         own = {frozenset((hand, link)) for hand in hands}
         bits[hold] = groups.get((hands, link), 0)
         if (hands, link) not in groups and not own & never and len(groups) < _GROUPS:

@@ -283,10 +283,8 @@ class Builder:
         thin: bool = False,
     ) -> Any:
         """Add a shape to a body; a `thin` mesh may have no volume."""
-        kinds, where = (
-            self.mj.mjtGeom,
-            {"name": name, "pos": place.translation, "quat": to_mujoco_quaternion(place)},
-        )
+        kinds = self.mj.mjtGeom
+        where = {"name": name, "pos": place.translation, "quat": to_mujoco_quaternion(place)}
         if isinstance(shape, coal.Box):
             return body.add_geom(type=kinds.mjGEOM_BOX, size=shape.halfSide, **where)
         if isinstance(shape, coal.Sphere):

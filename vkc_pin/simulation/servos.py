@@ -62,10 +62,8 @@ class Servo:
         """Set the rotor inertia and force limit of a joint of a `mujoco.MjSpec`."""
         joint.armature, joint.actgravcomp = self.armature, True
         if np.isfinite(self.limit):
-            joint.actfrclimited, joint.actfrcrange = (
-                mj.mjtLimited.mjLIMITED_TRUE,
-                [-self.limit, self.limit],
-            )
+            joint.actfrclimited = mj.mjtLimited.mjLIMITED_TRUE
+            joint.actfrcrange = [-self.limit, self.limit]
 
     def add_to(self, spec: Any, mj: Any) -> None:
         """Add the servo to a `mujoco.MjSpec` that contains its joint."""
@@ -73,10 +71,8 @@ class Servo:
             name=self.coordinate, target=self.coordinate, trntype=mj.mjtTrn.mjTRN_JOINT
         )
         actuator.gaintype, actuator.biastype = mj.mjtGain.mjGAIN_FIXED, mj.mjtBias.mjBIAS_AFFINE
-        actuator.gainprm[0], actuator.biasprm[:3] = (
-            self.stiffness,
-            [0.0, -self.stiffness, -self.damping],
-        )
+        actuator.gainprm[0] = self.stiffness
+        actuator.biasprm[:3] = [0.0, -self.stiffness, -self.damping]
 
 
 def make_servos(world: World, rows: Floats, physics: Physics) -> tuple[Servo, ...]:

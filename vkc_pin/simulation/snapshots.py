@@ -213,10 +213,8 @@ def write_video(executed: Execution, path: str | Path, *, rate: float = 25.0) ->
     Returns:
         The path.
     """
-    rate, encoder = (
-        arguments.check_number(rate, "rate", "frames per second", low=1.0, high=_MAX_RATE),
-        _find_ffmpeg(),
-    )
+    rate = arguments.check_number(rate, "rate", "frames per second", low=1.0, high=_MAX_RATE)
+    encoder = _find_ffmpeg()
     check_writable(path)
     times = np.arange(executed.trajectory.times[0], executed.trajectory.times[-1], 1.0 / rate)
     scene, size = RenderedScene(executed), "x".join(map(str, _SIZE))
@@ -267,11 +265,9 @@ def _add_visuals(builder: Builder, size: tuple[int, int], wall_opacity: float) -
             spec.geom(f"shape {number}").group = _VISIBLE_GROUP
     look = spec.visual
     look.global_.offwidth, look.global_.offheight, look.global_.fovy = *size, FIELD_OF_VIEW
-    look.headlight.ambient, look.headlight.diffuse, look.headlight.specular = (
-        [0.45] * 3,
-        [0.35] * 3,
-        [0.0] * 3,
-    )
+    look.headlight.ambient = [0.45] * 3
+    look.headlight.diffuse = [0.35] * 3
+    look.headlight.specular = [0.0] * 3
     sun = mj.mjtLightType.mjLIGHT_DIRECTIONAL
     spec.worldbody.add_light(
         type=sun, dir=[0.1, 0.15, -1.0], pos=[0.0, 0.0, 6.0], diffuse=[0.5] * 3

@@ -60,9 +60,8 @@ def find_drift(
     rows = samples.get_rows(phase)
     times = samples.times[rows]
     errors = samples.compute_grasp_errors(hold, rows)
-    if (
-        samples.scene.objects[hold.object].object.free or samples.is_truncated
-    ):  # it moves rigidly with the hand
+    # A free object moves rigidly with the hand.
+    if samples.scene.objects[hold.object].object.free or samples.is_truncated:
         return Drift(errors.max(axis=0), errors.max(axis=0), times[errors.argmax(axis=0)])
     hand, grasp = _find_hand_levers(samples, phase, hold), _find_grasp_levers(samples, hold)
 
@@ -131,9 +130,8 @@ def _bound_rates(trajectory: Trajectory, begin: Floats, end: Floats) -> tuple[Fl
     first, last = trajectory.velocity(begin), trajectory.velocity(end)
     at_begin = (6.0 * slope - 4.0 * first - 2.0 * last) / span
     at_end = (-6.0 * slope + 2.0 * first + 4.0 * last) / span
-    control = (
-        first + span * at_begin / 2.0
-    )  # of the velocity, a parabola in the hull of its control points
+    # The velocity is a parabola, in the hull of its control points: both ends, and this one.
+    control = first + span * at_begin / 2.0
     speed = np.maximum.reduce([np.abs(first), np.abs(control), np.abs(last)])
     return speed, np.maximum(np.abs(at_begin), np.abs(at_end))
 

@@ -55,10 +55,8 @@ class PairTable:
     ) -> None:
         self.scene, self.world, self.solids = scene, solids.world, solids
         world, own_margin = self.world, dist_safe if self_distance is None else self_distance
-        samples, lasts = (
-            Samples(scene, trajectory) if samples is None else samples,
-            [phase.last for phase in trajectory.phases],
-        )
+        samples = Samples(scene, trajectory) if samples is None else samples
+        lasts = [phase.last for phase in trajectory.phases]
         self._moves = np.array(
             [
                 self._find_moving_shapes(samples.z[samples.get_rows(phase)])
@@ -116,10 +114,8 @@ class PairTable:
 
     def find_exempt(self, pairs: Ints, waypoints: Ints) -> Bools:
         """Return which pairs the scene exempts from clearance at waypoints, shape (n,) each."""
-        exempt, (k, which) = (
-            np.zeros(len(pairs), bool),
-            self._windows.find(pairs, waypoints, waypoints),
-        )
+        exempt = np.zeros(len(pairs), bool)
+        k, which = self._windows.find(pairs, waypoints, waypoints)
         exempt[k[self._windows.is_exempt[which]]] = True
         return exempt
 
@@ -215,10 +211,8 @@ class _WindowIndex:
         """Return (k, window) for all windows of pair k that cover waypoints `first` to `last`."""
         some = np.flatnonzero(self._count[pairs])
         count = self._count[pairs[some]]
-        k, place = (
-            np.repeat(some, count),
-            np.repeat(self._begin[pairs[some]] - np.cumsum(count) + count, count),
-        )
+        k = np.repeat(some, count)
+        place = np.repeat(self._begin[pairs[some]] - np.cumsum(count) + count, count)
         which = self._which[place + np.arange(len(k))]
         holds = (self._first[which] <= first[k]) & (last[k] <= self._last[which])
         return k[holds], which[holds]
@@ -375,10 +369,8 @@ class _Sweep:
             )
             states = todo[at]
             distances = placed.compute_distances(states, self._table.pairs[pairs])
-            least, apart = (
-                np.full(len(placed), np.inf),
-                self._table.get_margins(pairs, states) > -np.inf,
-            )
+            least = np.full(len(placed), np.inf)
+            apart = self._table.get_margins(pairs, states) > -np.inf
             np.minimum.at(least, states[apart], distances[apart])
             done = ~(least > reach)  # all other pairs are further apart
             kept = done[states]

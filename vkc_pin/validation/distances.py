@@ -142,11 +142,9 @@ class PlacedShapes:
                 axis=1
             )
         ).tolist()
-        ball, here, shapes = (
-            coal.Sphere(POINT_RADIUS),
-            pin.SE3(np.eye(3), point),
-            self._solids.world.shapes,
-        )
+        ball = coal.Sphere(POINT_RADIUS)
+        here = pin.SE3(np.eye(3), point)
+        shapes = self._solids.world.shapes
         return [
             i
             for i in near

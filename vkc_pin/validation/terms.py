@@ -88,9 +88,8 @@ def _find_rows(samples: Samples, term: Constraint) -> tuple[Ints, Ints]:
 
 def _compute_inputs(samples: Samples, formula: Formula, rows: Ints) -> Floats:
     """Compute the inputs of a formula at samples, shape (S, 2·half + 1)."""
-    ends = np.searchsorted(
-        samples.waypoint_rows, rows
-    )  # the waypoint in which the segment of a sample ends
+    # The waypoint at which the segment of each sample ends.
+    ends = np.searchsorted(samples.waypoint_rows, rows)
     dt = np.diff(samples.trajectory.times, prepend=samples.trajectory.times[0] - 1.0)[ends]
     now = before = _compute_state_inputs(samples, formula, samples.z[rows])
     if formula.uses_previous:
@@ -114,10 +113,8 @@ def _compute_state_inputs(samples: Samples, formula: Formula, z: Floats) -> Floa
         pin.forwardKinematics(model, data, q)
         for k, frame in enumerate(frames):
             placement = pin.updateFramePlacement(model, data, frame)
-            row[12 * k : 12 * k + 9], row[12 * k + 9 : 12 * k + 12] = (
-                placement.rotation.T.ravel(),
-                placement.translation,
-            )
+            row[12 * k : 12 * k + 9] = placement.rotation.T.ravel()
+            row[12 * k + 9 : 12 * k + 12] = placement.translation
     for k, name in enumerate(formula.coordinates, start=12 * len(frames)):
         found[:, k] = z[:, coordinates.index(name)]
     return found

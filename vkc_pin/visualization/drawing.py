@@ -186,9 +186,8 @@ class Drawing:
         if robot not in _meshes:
             _meshes[robot] = [to_solid(shape.geometry) for shape in robot.visual.geometryObjects]
         items = []
-        placed = list(self.world.visual.geometryObjects)[
-            : len(_meshes[robot])
-        ]  # on the joints of its fingers, too
+        # The robot's shapes are the first, on the joints of its fingers, too.
+        placed = list(self.world.visual.geometryObjects)[: len(_meshes[robot])]
         for source, shape, solid in zip(
             robot.visual.geometryObjects, placed, _meshes[robot], strict=True
         ):

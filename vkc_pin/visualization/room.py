@@ -17,10 +17,9 @@ from vkc_pin.world.scene.scene import Scene
 
 __all__ = ["Part", "Room", "is_wall", "load_drawn_parts"]
 
-_THIN, _HIGH = (
-    0.25,
-    2.0,
-)  # [m]: an upright box at most this thick that reaches at least this high is a wall
+# An upright box at most this thick that reaches at least this high is a wall [m].
+_THIN = 0.25
+_HIGH = 2.0
 _BEYOND = 0.35  # a wall with more of the arena behind it is a partition [m]
 _VEIL, _DIVIDER = 0.07, 0.32  # opacities
 _FLOOR_COLOUR = (0.90, 0.89, 0.87)

@@ -181,9 +181,9 @@ def _write(group: h5py.Group, episode: Episode, robot: Robot, rate: float) -> No
     for name, values in arrays.items():
         _array(group, name, values, values.dtype)
     images = episode.images()
-    for name, pixels in (
-        {} if images is None else images.pictures.items()
-    ):  # a chunk each: loaders read single moments
+    pictures = {} if images is None else images.pictures
+    for name, pixels in pictures.items():
+        # A chunk for each moment: loaders read single ones.
         squeezed = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
         group.create_dataset(f"obs/{name}", data=pixels, chunks=(1, *pixels.shape[1:]), **squeezed)
     curve = {name: np.array(values) for name, values in motion.pop("curve", {}).items()}

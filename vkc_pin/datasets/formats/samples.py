@@ -64,8 +64,7 @@ def _hands(robot: Robot, configurations: Floats) -> Floats:
     for row, configuration in zip(rows, configurations, strict=True):
         pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(configuration))
         row[:] = pin.SE3ToXYZQUAT(data.oMf[frame])
-    turns = np.sign(
-        np.einsum("ij,ij->i", rows[1:, 3:], rows[:-1, 3:])
-    )  # q and -q are the same: no jumps between them
+    # q and -q are the same rotation: signs are chosen such that none jumps.
+    turns = np.sign(np.einsum("ij,ij->i", rows[1:, 3:], rows[:-1, 3:]))
     rows[1:, 3:] *= np.cumprod(np.where(turns == 0.0, 1.0, turns))[:, None]
     return rows

@@ -139,11 +139,9 @@ def plan_separately(
     assert best is not None
     _, status, tried, trajectory, report = best
     if ended and status not in ("success", ended):
-        status, notes = (
-            ended,
-            (*report.notes, f"the attempt with most progress failed with: {status}"),
-        )
-        report = dataclasses.replace(report, notes=notes)
+        note = f"the attempt with most progress failed with: {status}"
+        report = dataclasses.replace(report, notes=(*report.notes, note))
+        status = ended
     statistics = PlanningStatistics(
         planning_time=time.perf_counter() - began - built,
         build_time=built,

@@ -210,10 +210,8 @@ def motions_chart(plans: Mapping[str, Plan], path: str | Path | None, *, title: 
                 "drawstyle": "steps-post" if motion.curve is None else "default",
             }
             for k, joint in enumerate(range(3, motion.robot_size)):
-                colour, label = (
-                    COLOURS[k % len(COLOURS)],
-                    motion.names[joint].removesuffix("_joint"),
-                )
+                colour = COLOURS[k % len(COLOURS)]
+                label = motion.names[joint].removesuffix("_joint")
                 position.plot(fine, places[:, joint], color=colour, label=label)
                 velocity.plot(fine, rates[:, joint], color=colour, **steps)
             for k, label in enumerate(_BASE):

@@ -236,9 +236,8 @@ def _run(
             bar.update()
             if "traceback" in line:
                 (message,) = line["records"][0]["violations"]
-                detail = (
-                    "" if message in told else f"\n{line['traceback']}"
-                )  # many trials may fail alike
+                # Many trials may fail alike.
+                detail = "" if message in told else f"\n{line['traceback']}"
                 tqdm.write(
                     f"{line['key']} failed with an error: {message}{detail}", file=sys.stderr
                 )

@@ -90,10 +90,8 @@ class ImportedObject:
 
     def summary(self) -> str:
         """Return a readable report."""
-        pieces, joints = (
-            len(self.object.collision.geometryObjects),
-            len(self.object.coordinates.names),
-        )
+        pieces = len(self.object.collision.geometryObjects)
+        joints = len(self.object.coordinates.names)
         size = " × ".join(f"{length:.2f}" for length in self.size)
         counts = f"{joints} joint{'s' * (joints != 1)}, {pieces} convex pieces"
         head = f"{self.object.name}: {size} m, {counts}"
@@ -244,11 +242,9 @@ def import_object(  # noqa: PLR0913 - keyword options of a public call
     description = add_missing_limits(description)
     # `check_target` allowed replacing it
     with write_folder_atomically(target, force=True, source=path) as staging:
-        yaml, urdf, picture = (
-            staging / f"{name}.yaml",
-            staging / f"{name}.urdf",
-            staging / "attachments.png",
-        )
+        yaml = staging / f"{name}.yaml"
+        urdf = staging / f"{name}.urdf"
+        picture = staging / "attachments.png"
         write_urdf(description, urdf)
         about = [f"Made of {path.name} {get_origin_marker(_COMMAND)}."]
         if link is not None and link != name:

@@ -205,10 +205,8 @@ class _Reader:
         if len(models) != 1:
             expected, got = "one <model>", f"{len(models)} models"
             raise InputError("not a model", file=file, expected=expected, got=got)
-        inner, files = (
-            Scope(file, models[0], rules, scope, include=include),
-            (*files, file.resolve()),
-        )
+        inner = Scope(file, models[0], rules, scope, include=include)
+        files = (*files, file.resolve())
         if is_true(include.get("merge", "false")):
             scope.merged.append(inner)
             self._fill_inner_scope(inner, files, "")

@@ -152,10 +152,8 @@ def _format_inertia(inertia: pin.Inertia) -> list[str]:
         for i in range(3)
         for j in range(i, 3)
     )
-    origin, mass = (
-        f'<origin xyz="{_format_numbers(inertia.lever)}"/>',
-        f'<mass value="{inertia.mass:.9g}"/>',
-    )
+    origin = f'<origin xyz="{_format_numbers(inertia.lever)}"/>'
+    mass = f'<mass value="{inertia.mass:.9g}"/>'
     return [f"    <inertial>{origin}{mass}<inertia {entries}/></inertial>"]
 
 

@@ -80,15 +80,11 @@ def find_openings(item: ArticulatedObject, pieces: dict[int, list[Piece]]) -> di
     pin.computeJointJacobians(item.model, data, item.coordinates.q(state))
     for number in range(1, item.model.njoints):
         name = str(item.model.names[number])
-        coordinate, closed = (
-            item.coordinates.index(name),
-            float(state[item.coordinates.index(name)]),
-        )
+        coordinate = item.coordinates.index(name)
+        closed = float(state[coordinate])
         low, high = float(item.lower[coordinate]), float(item.upper[coordinate])
-        low, high = (
-            max(low, closed - _ASSUMED_TRAVEL) if np.isinf(low) else low,
-            min(high, closed + _ASSUMED_TRAVEL) if np.isinf(high) else high,
-        )
+        low = max(low, closed - _ASSUMED_TRAVEL) if np.isinf(low) else low
+        high = min(high, closed + _ASSUMED_TRAVEL) if np.isinf(high) else high
         opened = high if high - closed >= closed - low else low
         # For a model of one joint, Pinocchio returns a vector.
         jacobian = np.reshape(pin.getJointJacobian(item.model, data, number, pin.LOCAL), (6, -1))
@@ -139,10 +135,8 @@ def score_grasp(grasp: Candidate, tool: pin.SE3, opening: Opening, *, named: boo
     if opening.turns:
         arm = place - opening.origin
         arm -= (arm @ opening.axis) * opening.axis
-        pull, leverage = (
-            np.cross(opening.axis, arm),
-            float(np.linalg.norm(arm)) / max(opening.reach, 1e-3),
-        )
+        pull = np.cross(opening.axis, arm)
+        leverage = float(np.linalg.norm(arm)) / max(opening.reach, 1e-3)
         pull /= max(float(np.linalg.norm(pull)), 1e-9)
         eccentricity = abs(offset @ opening.axis) / (np.abs(opening.axis) @ size / 2.0)
     else:
@@ -297,10 +291,8 @@ class GraspMotion:
 
     def follow(self, opening: Opening) -> float:
         """Return how far a joint opens, [rad] or [m], before the hand is obstructed."""
-        reached, reachable = (
-            opening.closed,
-            self._grow(self._find_free_angles(), self._angles == 0.0),
-        )
+        reached = opening.closed
+        reachable = self._grow(self._find_free_angles(), self._angles == 0.0)
         start = float(self._state[opening.coordinate])
         for value in np.linspace(start, opening.opened, _SAMPLES + 1)[1:].tolist():
             state = self._state.copy()

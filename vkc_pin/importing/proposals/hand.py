@@ -74,10 +74,8 @@ def make_hand(robot: Robot) -> Hand:
         raise InputError(
             problem, file=robot.urdf, field="touch_links", expected=expected, got="none"
         )
-    data, frame = (
-        robot.model.createData(),
-        robot.model.frames[robot.model.getFrameId(robot.tool_frame)],
-    )
+    data = robot.model.createData()
+    frame = robot.model.frames[robot.model.getFrameId(robot.tool_frame)]
     pin.framesForwardKinematics(
         robot.model, data, robot.coordinates.q(np.concatenate([np.zeros(3), robot.home]))
     )
@@ -108,12 +106,9 @@ def make_hand(robot: Robot) -> Hand:
             )
         expected = "an open hand around its origin, with x as the closing direction"
         raise InputError(problem, file=robot.urdf, field="tool_frame", expected=expected)
-    beyond = [
-        box
-        for geometry, where in fingers
-        if (box := compute_world_box(geometry, where))[1][2] > 0.0
-    ]  # shapes that extend beyond the origin
-    ends = beyond or [compute_world_box(geometry, where) for geometry, where in fingers]
+    boxes = [compute_world_box(geometry, where) for geometry, where in fingers]
+    beyond_origin = [(low, high) for low, high in boxes if high[2] > 0.0]
+    ends = beyond_origin or boxes
     width = max(high[1] for _, high in ends) - min(low[1] for low, _ in ends)
     return Hand(
         robot.name,

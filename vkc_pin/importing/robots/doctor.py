@@ -253,10 +253,8 @@ def _check_units(robot: Robot) -> list[Finding]:
 
 
 def _check_limits_and_masses(robot: Robot) -> list[Finding]:
-    planned_joints, findings = (
-        {name: k for k, name in enumerate(robot.coordinates.names) if k > 2},
-        [],
-    )
+    planned_joints = {name: k for k, name in enumerate(robot.coordinates.names) if k > 2}
+    findings = []
     no_velocity = dict[str, list[str]]()  # joints by assumed limit
     no_effort, unlimited = [], []
     for joint in robot.file.root.findall("joint"):

@@ -335,10 +335,8 @@ class _HandAnalysis:
         moving = self._full.joints[self._full.getJointId(joint)]
         if moving.nq == 2:
             return [rest]
-        low, high = (
-            self._full.lowerPositionLimit[moving.idx_q],
-            self._full.upperPositionLimit[moving.idx_q],
-        )
+        low = self._full.lowerPositionLimit[moving.idx_q]
+        high = self._full.upperPositionLimit[moving.idx_q]
         if not (np.isfinite([low, high]).all() and high - low < 2.0 * np.pi):
             return [rest]
         return [rest, float(low), float(0.5 * (low + high)), float(high)]

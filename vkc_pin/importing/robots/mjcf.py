@@ -415,10 +415,8 @@ class _Converter:
 
     def _convert_couplings(self) -> None:
         """Write couplings of two joints as <mimic>."""
-        model, joints = (
-            self._model,
-            {joint.get("name", ""): joint for joint in self._result.root.findall("joint")},
-        )
+        model = self._model
+        joints = {joint.get("name", ""): joint for joint in self._result.root.findall("joint")}
         leads: dict[str, str] = {}
         for k in np.flatnonzero(
             (model.eq_type == int(self._mujoco.mjtEq.mjEQ_JOINT)) & (model.eq_active0 > 0)
@@ -430,19 +428,15 @@ class _Converter:
             ]
             if len(names) < 2 or not joints.keys() >= {*names}:
                 continue
-            (joint, leader), (offset, factor) = (
-                names,
-                (float(value) for value in model.eq_data[k, :2]),
-            )
+            joint, leader = names
+            offset, factor = (float(value) for value in model.eq_data[k, :2])
             if model.eq_data[k, 2:5].any():
                 self._result.notes.append(
                     f"joint {joint} follows {leader} by a nonlinear function: it is linearized"
                 )
             if joint in leads and leader not in leads and factor:
-                (joint, leader), (offset, factor) = (
-                    (leader, joint),
-                    (-offset / factor, 1.0 / factor),
-                )
+                joint, leader = (leader, joint)
+                offset, factor = (-offset / factor, 1.0 / factor)
             follower = leader
             while follower in leads:
                 follower = leads[follower]

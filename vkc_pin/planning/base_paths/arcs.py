@@ -52,7 +52,7 @@ class Curves:
         The final heading equals that of `last` up to full turns.
         """
         if self.radius <= 0.0:
-            (turn, rest) = min(
+            turn, rest = min(
                 self._turns(first[None], last[None]), key=lambda turns: float(np.abs(turns).sum())
             )
             ahead = float(first[2] + turn[0])
@@ -147,10 +147,8 @@ def find_nearest_arc(first: Floats, last: Floats, *, radius: float, turning: flo
     turn = np.concatenate([asked + off, 0.0 * asked], axis=1)
     dx, dy = (last - first)[:, 0:1], (last - first)[:, 1:2]
     heading = first[:, 2:] + turn / 2
-    along, aside = (
-        np.cos(heading) * dx + np.sin(heading) * dy,
-        np.cos(heading) * dy - np.sin(heading) * dx,
-    )
+    along = np.cos(heading) * dx + np.sin(heading) * dy
+    aside = np.cos(heading) * dy - np.sin(heading) * dx
     error = (
         aside**2
         + (turning * (turn - asked)) ** 2

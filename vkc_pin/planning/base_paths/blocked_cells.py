@@ -264,9 +264,8 @@ def _fill_cells(
         [part for _, part in parts[1].values()], DIRECTIONS[None]
     )
     record_evaluations()
-    allowed = (
-        _MIN_COSINE * margin - overshoot[moving] - other_overshoot[standing] - _ROUNDING
-    )  # (pairs, H)
+    # Shape (pairs, H).
+    allowed = _MIN_COSINE * margin - overshoot[moving] - other_overshoot[standing] - _ROUNDING
     reach = (
         (support[moving] + other_support[standing] + allowed[..., None])
         .reshape(-1, len(DIRECTIONS))

@@ -245,10 +245,8 @@ def find_free_floor(scene: Scene) -> tuple[CellGrid, Bools]:
 
 def _compute_signed_distance(outline: Floats, x: Floats, y: Floats) -> Floats:
     """Return signed distances from a convex polygon, negative inside."""
-    square, inside = (
-        np.full((len(x), y.shape[1]), np.inf),
-        np.full((len(x), y.shape[1]), len(outline) > 2),
-    )
+    square = np.full((len(x), y.shape[1]), np.inf)
+    inside = np.full((len(x), y.shape[1]), len(outline) > 2)
     for (ax, ay), (bx, by) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
         ex, ey, ox, oy = bx - ax, by - ay, x - ax, y - ay
         share = np.clip((ox * ex + oy * ey) / max(ex * ex + ey * ey, _TINY), 0.0, 1.0)

@@ -337,16 +337,12 @@ class _PairBuilder:
     def build_phase(self, number: int) -> PhaseGeometry:
         phase, scene, chain = self.task.phases[number], self.scene, self.chain
         holds = {hold.object: hold for hold in phase.held}
-        shapes, labels = (
-            list(chain.get_collision_geometry(phase.opening).geometryObjects),
-            list(self._labels),
-        )
+        shapes = list(chain.get_collision_geometry(phase.opening).geometryObjects)
+        labels = list(self._labels)
         of_chain = self._compute_boxes[0] if phase.opening is None else _compute_boxes(shapes)
-        robots, own, margin = (
-            range(len(scene.robot.collision.geometryObjects)),
-            len(shapes),
-            self.options.dist_safe,
-        )
+        robots = range(len(scene.robot.collision.geometryObjects))
+        own = len(shapes)
+        margin = self.options.dist_safe
         pairs = [
             (*pair, own_margin)
             for pair, own_margin in scene.robot.own_margins(self.options.self_distance).items()
@@ -367,9 +363,8 @@ class _PairBuilder:
             moving += attached_shapes[hold.object]
         for ride in phase.supported:
             attached_shapes[ride.object] = chain.ride_geometries[ride]
-            same_joint = {
-                shapes[j].parentJoint for j in attached_shapes[ride.object]
-            }  # it moves rigidly with geometry on the same joint
+            # The object moves rigidly with geometry on these joints.
+            same_joint = {shapes[j].parentJoint for j in attached_shapes[ride.object]}
             pairs += [
                 (i, j, margin)
                 for i in moving
@@ -497,10 +492,8 @@ class _PairBuilder:
         kept = np.isfinite(table[:, 2])
         place, margin_regions = np.where(kept, np.cumsum(kept) - 1, -1), []
         for one in self._allowances:
-            exempt_pairs, resolved = (
-                place[rows[one]][kept[rows[one]]],
-                self._resolve_ranges(phase, one.ranges),
-            )
+            exempt_pairs = place[rows[one]][kept[rows[one]]]
+            resolved = self._resolve_ranges(phase, one.ranges)
             if one.ranges and len(exempt_pairs) and resolved is not None:
                 margin = (
                     one.margin if one.margin < 0.0 else REDUCED_MARGIN_RATIO * max(one.nearest, 0.0)

@@ -98,12 +98,10 @@ class PoseSolver:
             errors[unsolved] = error[:, 0]
             is_unsolved = error[:, 0] >= tolerance
             if not is_unsolved.all():
-                unsolved, moved, lower, upper = (
-                    unsolved[is_unsolved],
-                    moved[is_unsolved],
-                    lower[is_unsolved],
-                    upper[is_unsolved],
-                )
+                unsolved = unsolved[is_unsolved]
+                moved = moved[is_unsolved]
+                lower = lower[is_unsolved]
+                upper = upper[is_unsolved]
             if not len(unsolved) or not remaining:
                 break
             z[unsolved] = rows = moved

@@ -165,10 +165,9 @@ def compute_pose_offsets(
         translations: Translations of the frames, shape (B, 3) [m].
         target: Target placement.
     """
-    axis_sine, cosine = (
-        np.zeros((len(rotations), 3)),
-        np.ones(len(rotations)),
-    )  # a·sin and cos of θ, or of θ/2 for a pose
+    # Axis times sine, and cosine, of the angle θ, or of θ/2 for a pose.
+    axis_sine = np.zeros((len(rotations), 3))
+    cosine = np.ones(len(rotations))
     if (
         kind in _VERTICAL
         # θ is the tilt of the vertical in the world; an upside-down frame tilts about any level
@@ -176,20 +175,17 @@ def compute_pose_offsets(
     ):
         vertical = rotations[:, 2] @ target.rotation.T
         axis_sine = np.column_stack([vertical[:, 1], -vertical[:, 0], np.zeros(len(axis_sine))])
-        axis_sine, cosine = (
+        axis_sine = (
             np.where(axis_sine.any(axis=1, keepdims=True), axis_sine, [1e-99, 0.0, 0.0])
-            @ target.rotation,
-            vertical[:, 2],
+            @ target.rotation
         )
+        cosine = vertical[:, 2]
     elif kind == "pose":
-        errors = map(
-            np.asfortranarray, target.rotation.T @ rotations
-        )  # eigenpy never frees its copies of row-major matrices
+        # eigenpy never frees its copies of row-major matrices.
+        errors = map(np.asfortranarray, target.rotation.T @ rotations)
         quaternions = np.array([pin.Quaternion(error).coeffs() for error in errors]).reshape(-1, 4)
-        axis_sine, cosine = (
-            quaternions[:, :3] * np.where(quaternions[:, 3:] < 0.0, -1.0, 1.0),
-            np.abs(quaternions[:, 3]),
-        )
+        axis_sine = quaternions[:, :3] * np.where(quaternions[:, 3:] < 0.0, -1.0, 1.0)
+        cosine = np.abs(quaternions[:, 3])
     size = np.linalg.norm(axis_sine, axis=1, keepdims=True)
     axis = np.where(size > 0.0, axis_sine / np.maximum(size, np.finfo(float).tiny), [0.0, 0.0, 1.0])
     angle = (2.0 if kind == "pose" else 1.0) * np.arctan2(size[:, 0], cosine)

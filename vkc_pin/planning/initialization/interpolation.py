@@ -199,11 +199,9 @@ class Interpolator:
         Returns:
             z_1..z_N, shape (N, n); None if a phase has no path.
         """
-        problem, keyframes, objects = (
-            self.problem,
-            through.copy(),
-            self.sampler.object_motion.copy(),
-        )
+        problem = self.problem
+        keyframes = through.copy()
+        objects = self.sampler.object_motion.copy()
         z = np.empty((problem.segments, problem.chain.size))
         begin, previous = 0, None
         for number, (phase, end) in enumerate(

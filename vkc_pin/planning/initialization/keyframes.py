@@ -390,11 +390,9 @@ def sample_goal_configurations(
         waypoint has neither a pose constraint nor a fixed base position.
     """
     sampler = KeyframeSampler(problem, rng)
-    pose, lower, upper = (
-        sampler.find_pose(waypoint),
-        problem.lower[waypoint - 1],
-        problem.upper[waypoint - 1],
-    )
+    pose = sampler.find_pose(waypoint)
+    lower = problem.lower[waypoint - 1]
+    upper = problem.upper[waypoint - 1]
     z = np.tile(problem.start, (SAMPLE_COUNT, 1))
     for column in sampler.find_grasp_columns(waypoint):  # the earlier grasp is free here
         low, high = np.clip([lower[column], upper[column]], -np.pi, np.pi)

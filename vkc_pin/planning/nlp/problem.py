@@ -204,10 +204,8 @@ class TrajectoryProblem:
         """
         structure, path = self.transcription.structure, self.waypoints(z)
         limits = self.chain.velocity, self.chain.acceleration
-        runs, least = (
-            split_at_stops(structure.stops, self.segments),
-            self.rolling.compute_min_times(path),
-        )
+        runs = split_at_stops(structure.stops, self.segments)
+        least = self.rolling.compute_min_times(path)
         dt = compute_step_times(path, self.options.dt, runs, limits, least)
         if structure.is_timed:
             dt = self.term_evaluator.lengthen_steps(z, dt, runs)

@@ -214,10 +214,8 @@ class Separation:
         """
         problem, part = self.problem, self.contacts.phases[stretch.phase]
         begin = problem.ends[stretch.phase - 1] if stretch.phase else 0
-        first, last = (
-            max(stretch.first - 1, begin),
-            min(stretch.last + 1, problem.ends[stretch.phase] - 1),
-        )
+        first = max(stretch.first - 1, begin)
+        last = min(stretch.last + 1, problem.ends[stretch.phase] - 1)
         rows = np.arange(first, last + 1)
         middle = z[[(stretch.first + stretch.last) // 2]]
         rotations, _ = self.contacts.compute_placements(middle)

@@ -44,11 +44,12 @@ _COLOURS: dict[str, tuple[float, float, float]] = {
 }
 _DENSITY = 500.0  # [kg/m³], wood; hollow bodies are built of their walls
 _NO_ROTATION = (0.0, 0.0, 0.0)
+# Roll, pitch and yaw of a cylinder along each axis.
 _CYLINDER_RPY = {
     "x": (0.0, math.pi / 2.0, 0.0),
     "y": (math.pi / 2.0, 0.0, 0.0),
     "z": _NO_ROTATION,
-}  # roll, pitch, yaw of a cylinder
+}
 _VELOCITY = {"revolute": 1.0, "prismatic": 0.5}  # [rad/s], [m/s]
 _EFFORT = {"revolute": 30.0, "prismatic": 40.0}  # [N·m], [N]
 _POST = 0.02  # [m] from a bar's ends to the posts that carry it

@@ -156,11 +156,9 @@ def make_openable(
     footprint, items, up = frame.make_rectangle((low[0], high[0]), sides), [], own.lift
     if counter:
         depth, width, height = counter.size
-        sides, face, up = (
-            (middle - width / 2.0, middle + width / 2.0),
-            -counter.setback,
-            height + own.lift,
-        )
+        sides = (middle - width / 2.0, middle + width / 2.0)
+        face = -counter.setback
+        up = height + own.lift
         footprint = frame.make_rectangle((face, face + depth), sides)
         centre = (face + depth / 2.0, middle)
         items = [

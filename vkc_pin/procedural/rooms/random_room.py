@@ -252,10 +252,8 @@ def sample_layout(number: int, settings: RoomSettings | None = None, **changes: 
         RoomSettings() if settings is None else check_instance(settings, RoomSettings, "settings"),
         **changes,
     )
-    rng, radius = (
-        np.random.default_rng([1, number]),
-        _compute_turning_radius(load_robot(chosen.robot)),
-    )
+    rng = np.random.default_rng([1, number])
+    radius = _compute_turning_radius(load_robot(chosen.robot))
     named = None if chosen.objects is None else _name_fixtures(chosen.objects, number)
     for _ in range(_MAX_ROOMS):
         found = _Room(chosen, rng, radius).furnish(named)
@@ -434,10 +432,8 @@ class _Room:
     def _propose_boxes(self, name: str) -> Iterator[Part]:
         colour = _COLOURS[int(self.rng.integers(len(_COLOURS)))]
         while True:
-            size, yaw = (
-                self._sample_size((0.25, 0.8), (0.25, 0.8), (0.3, 1.4)),
-                round(float(self.rng.uniform(-math.pi, math.pi)), 3),
-            )
+            size = self._sample_size((0.25, 0.8), (0.25, 0.8), (0.3, 1.4))
+            yaw = round(float(self.rng.uniform(-math.pi, math.pi)), 3)
             yield parts.make_box(name, self._sample_frame(yaw), size, colour)
 
     def _place_carried_object(self, kind: str, number: int, on: Part) -> Part:

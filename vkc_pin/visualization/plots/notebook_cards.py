@@ -20,11 +20,9 @@ from vkc_pin.world.trajectory.world_model import World
 
 __all__ = ["motion_html", "scene_html"]
 
-_SIDE, _DPI, _COLOURS = (
-    4.4,
-    72,
-    96,
-)  # [inch] of the picture's longer side, its resolution, and its colours
+_SIDE = 4.4  # [inch], longer side of the picture
+_DPI = 72
+_COLOURS = 96  # of its palette
 _LISTED = 6  # violations and notes shown; the report has all of them
 _GOOD, _BAD = "#1a7f37", "#c62828"
 

@@ -124,10 +124,8 @@ def compute_clearance_curves(
         for kind in _KINDS
         if ((kinds == kind) & asked).any()
     }
-    placed, curves = (
-        table.solids.place(world.coordinates.q(world.compute_positions(trajectory, moments))),
-        [],
-    )
+    placed = table.solids.place(world.coordinates.q(world.compute_positions(trajectory, moments)))
+    curves = []
     for kind, pairs in groups.items():
         which, distances = placed.find_nearest(pairs)
         names = tuple(

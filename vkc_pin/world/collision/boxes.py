@@ -93,10 +93,8 @@ class WorldBoxes:
             np.ascontiguousarray(part, np.int64)
             for part in (np.column_stack([first, last]), phases)
         )
-        flags, rows = (
-            np.ascontiguousarray(moves).view(np.uint8),
-            np.ascontiguousarray(pairs, np.int64),
-        )
+        flags = np.ascontiguousarray(moves).view(np.uint8)
+        rows = np.ascontiguousarray(pairs, np.int64)
         intervals, which = self.compiled.near(
             *numbers, flags, rows, np.ascontiguousarray(moved, float), limit
         )

@@ -149,9 +149,8 @@ def _read_start(file: str | Path, kind: str, count: int) -> tuple[bytes, int]:
     """Return the first bytes of a file, at most `count`, and its size [bytes]."""
     path, expected = Path(file), f"an existing {kind} file"
     try:
-        if (
-            not path.is_file() and not path.is_dir() and path.exists()
-        ):  # reading a pipe would wait for ever
+        is_special = path.exists() and not path.is_file() and not path.is_dir()
+        if is_special:  # reading a pipe would wait for ever
             raise InputError(
                 f"cannot read the {kind}", file=file, expected=expected, got="a pipe or a device"
             )
@@ -180,9 +179,8 @@ def read_text(file: str | Path, kind: str, largest: int | None = None) -> str:
 
 def parse_json(text: str, file: str | Path) -> Any:
     """Return the data of a JSON text."""
-    many = text.count("[") + text.count(
-        "{"
-    )  # before they are made: each takes twenty times its text
+    # Counted before they are made: each takes twenty times the memory of its text.
+    many = text.count("[") + text.count("{")
     if many > MAX_FIELDS:
         raise InputError(
             "too many lists and objects", file=file, expected=f"at most {MAX_FIELDS}", got=many
@@ -345,10 +343,8 @@ def _record_lines(
     if isinstance(node, yaml.MappingNode):
         seen: dict[str, int] = {}
         for key, value in node.value:
-            name, line = (
-                key.value if isinstance(key, yaml.ScalarNode) else str(key.value),
-                key.start_mark.line + 1,
-            )
+            name = key.value if isinstance(key, yaml.ScalarNode) else str(key.value)
+            line = key.start_mark.line + 1
             if name in seen:
                 lines_of = f"lines {seen[name]} and {line}"
                 problem = "this field stands here twice"
@@ -409,10 +405,8 @@ def _translate_error(document: Document, path: tuple[Key, ...], error: Any) -> I
             path, context["problem"], expected=context["expected"], got=format_value(got)
         )
     if kind in _SIGNS:
-        problem, expected = (
-            "out of range",
-            f"a number {_SIGNS[kind]} {next(iter(context.values())):g}",
-        )
+        problem = "out of range"
+        expected = f"a number {_SIGNS[kind]} {next(iter(context.values())):g}"
     else:
         problem, expected = "wrong value", _EXPECTED.get(kind, error["msg"])
     return document.make_error(path, problem, expected=expected, got=format_value(got))

@@ -166,10 +166,8 @@ def _compute_cut_volumes(polytope: ConvexHull, normals: Floats, offsets: Floats)
     heights = np.einsum("ijk,lk->lij", corners, normals) - offsets[:, None, None]
     low, middle, high = np.moveaxis(np.sort(heights, axis=2), 2, 0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        tip, foot = (
-            high**2 / ((high - low) * (high - middle)),
-            1.0 - low**2 / ((low - middle) * (low - high)),
-        )
+        tip = high**2 / ((high - low) * (high - middle))
+        foot = 1.0 - low**2 / ((low - middle) * (low - high))
     share = np.where(middle <= 0.0, np.where(high > 0.0, tip, 0.0), np.where(low < 0.0, foot, 1.0))
     return np.asarray((share * cones).sum(axis=1))
 

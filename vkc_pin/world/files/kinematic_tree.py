@@ -34,10 +34,8 @@ _MAX_MASS = 1e9  # [kg], and of moments of inertia [kg·m²]
 _JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 _LIMITED_TYPES = ("revolute", "prismatic")
 _TYPES_WITHOUT_AXIS = ("fixed", "floating")
-_XACRO_DEFINITIONS = (
-    "xacro:arg",
-    "xacro:property",
-)  # of xacro's elements those that put nothing in their place
+# Of xacro's elements those that put nothing in their place.
+_XACRO_DEFINITIONS = ("xacro:arg", "xacro:property")
 
 
 def _check_limits(file: Path, name: str, joint: ElementTree.Element) -> None:
@@ -243,9 +241,9 @@ def parse_numbers(
         values = ()
     is_valid = len(values) == count and all(abs(value) <= largest for value in values)
     if not is_valid or (is_finite and not all(map(math.isfinite, values))):
-        field, expected = (
-            f"{where}: {element.tag} {key}",
-            f"{count} finite numbers with spaces between them" if count > 1 else "1 finite number",
+        field = f"{where}: {element.tag} {key}"
+        expected = (
+            f"{count} finite numbers with spaces between them" if count > 1 else "1 finite number"
         )
         if values and len(values) == count and all(map(math.isfinite, values)):
             expected = f"at most {largest:g}"

@@ -340,9 +340,8 @@ def make_convex_hull(
             stacklevel=2,
         )
     hull = compute_hull(given)
-    if (
-        np.bincount(np.asarray(hull.faces).ravel()).max() > _MAX_NEIGHBOURS
-    ):  # the tip of a finely meshed cone, a fine disc
+    faces_per_corner = np.bincount(np.asarray(hull.faces).ravel())
+    if faces_per_corner.max() > _MAX_NEIGHBOURS:  # the tip of a finely meshed cone, a fine disc
         hull = compute_outer_hull(hull.vertices, vertices=60)
     shape = _make_convex(hull.vertices, np.asarray(hull.faces).tolist())
     # Volumes of small hulls far from the origin are inexact; this one is about the hull's middle.
@@ -511,14 +510,11 @@ def _fix_box_support() -> None:
     `getShapeSupport`). These queries, without such a component, precede all others.
     """
     turned = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
-    box, here, there = (
-        coal.Box(1.0, 1.0, 1.0),
-        coal.Transform3s(),
-        coal.Transform3s(turned, np.array([3.0, 0.4, 0.2])),
-    )
-    plane = coal.Halfspace(
-        np.array([0.36, 0.48, 0.8]), 0.0
-    )  # for the other one, of shapes with a swept sphere
+    box = coal.Box(1.0, 1.0, 1.0)
+    here = coal.Transform3s()
+    there = coal.Transform3s(turned, np.array([3.0, 0.4, 0.2]))
+    # For the other support function, of shapes with a swept sphere.
+    plane = coal.Halfspace(np.array([0.36, 0.48, 0.8]), 0.0)
     for shape, where in ((coal.Capsule(0.1, 0.5), there), (plane, here)):
         coal.distance(shape, here, box, where, coal.DistanceRequest(), coal.DistanceResult())
 

@@ -154,10 +154,8 @@ class UrdfFile:
         origin = element.find("origin")
         placement = pin.SE3.Identity()
         if origin is not None:
-            position, angles = (
-                self._numbers(origin, "xyz", 3, "0 0 0", name),
-                self._numbers(origin, "rpy", 3, "0 0 0", name),
-            )
+            position = self._numbers(origin, "xyz", 3, "0 0 0", name)
+            angles = self._numbers(origin, "rpy", 3, "0 0 0", name)
             placement = pin.SE3(_compute_rotation(*angles), np.array(position))
         material = element.find("material")
         colour = (
@@ -166,10 +164,8 @@ class UrdfFile:
             else self._colour(material) or colours.get(material.get("name", ""))
         )
         if shape.tag == "mesh":
-            file, scale = (
-                self.resolve(shape.get("filename", "")),
-                self._numbers(shape, "scale", 3, "1 1 1", name),
-            )
+            file = self.resolve(shape.get("filename", ""))
+            scale = self._numbers(shape, "scale", 3, "1 1 1", name)
             return UrdfShape(link, name, placement, "mesh", scale, file=file, colour=colour)
         if shape.tag == "box":
             size = self._numbers(shape, "size", 3, None, name)
@@ -272,10 +268,8 @@ def load_urdf(
             problem = "joints that mimic others are not supported"
             raise make_element_error(path, joint, problem, field=name, expected="no <mimic>")
     model = build_model(file)
-    collision, visual = (
-        _build_geometry(model, file, "collision"),
-        _build_geometry(model, file, "visual"),
-    )
+    collision = _build_geometry(model, file, "collision")
+    visual = _build_geometry(model, file, "visual")
     if len(visual.geometryObjects) > 0 and len(collision.geometryObjects) == 0:
         raise InputError(
             "nothing in this URDF can collide",
@@ -303,10 +297,8 @@ def _build_geometry(model: pin.Model, file: UrdfFile, kind: str) -> pin.Geometry
         added = pin.GeometryObject(
             shape.name, frame.parentJoint, index, frame.placement * shape.placement, solid
         )
-        added.meshColor, added.overrideMaterial = (
-            np.array(shape.colour or _LIGHT_GREY),
-            shape.colour is not None,
-        )
+        added.meshColor = np.array(shape.colour or _LIGHT_GREY)
+        added.overrideMaterial = shape.colour is not None
         if shape.file is not None:  # viewers draw the file
             added.meshPath, added.meshScale = str(shape.file), np.array(shape.size)
         geometry.addGeometryObject(added)
@@ -318,11 +310,9 @@ def _compute_rotation(roll: float, pitch: float, yaw: float) -> Floats:
     (a, u), (b, v), (c, w) = (
         (math.sin(angle / 2.0), math.cos(angle / 2.0)) for angle in (roll, pitch, yaw)
     )
-    x, y, z, s = (
-        a * v * w - u * b * c,
-        u * b * w + a * v * c,
-        u * v * c - a * b * w,
-        u * v * w + a * b * c,
-    )
+    x = a * v * w - u * b * c
+    y = u * b * w + a * v * c
+    z = u * v * c - a * b * w
+    s = u * v * w + a * b * c
     norm = math.sqrt(x * x + y * y + z * z + s * s)
     return np.array(pin.Quaternion(s / norm, x / norm, y / norm, z / norm).matrix())

@@ -74,9 +74,8 @@ def check_writable(path: str | Path, *, field: str | None = None) -> Path:
         for name in missing:  # no file system takes any name
             with contextlib.suppress(FileNotFoundError):
                 (place / name).lstat()
-        temporary = _make_temporary_path(
-            place
-        )  # only trying tells: of a disk that is read-only, say
+        # Only trying tells whether a disk is read-only, say.
+        temporary = _make_temporary_path(place)
         with defer_interrupt():
             try:
                 temporary.open("xb").close()
@@ -324,9 +323,8 @@ def _make_temporary_path(folder: Path) -> Path:
 
 @contextlib.contextmanager
 def _report_path_errors(path: str | Path, field: str | None = None) -> Iterator[None]:
-    path = (
-        path if isinstance(path, str) else check_path(path, "path")
-    )  # text may end with a slash, which paths forget
+    # Text stays text: it may end with a slash, which paths forget.
+    path = path if isinstance(path, str) else check_path(path, "path")
     try:
         yield
     except (OSError, ValueError) as error:  # the latter: a NUL in the name

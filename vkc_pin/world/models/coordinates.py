@@ -77,35 +77,29 @@ class Coordinates:
         lower, upper = [], []
         followers = [int(index) for index in model.mimicking_joints]
         for index in range(1, model.njoints):
-            joint, name, i, j = (
-                model.joints[index],
-                model.names[index],
-                model.joints[index].idx_q,
-                len(names),
-            )
+            joint = model.joints[index]
+            name = model.names[index]
+            i = model.joints[index].idx_q
+            j = len(names)
             if joint.nv == 0 and index in followers:
                 continue
-            kind, limited, direct = (
-                joint.shortname(),
-                0,
-                0,
-            )  # numbers of coordinates with limits, and of those equal to entries of q
+            kind = joint.shortname()
+            limited = 0  # number of coordinates with position limits
+            direct = 0  # number of coordinates that are entries of q themselves
             if kind == "JointModelPlanar":
                 parts, limited, direct = {"_x": "m", "_y": "m", "_yaw": "rad"}, 2, 2
                 angles.append((i + 2, j + 2))
             elif kind == "JointModelFreeFlyer":
-                parts, direct = (
-                    {
-                        "_x": "m",
-                        "_y": "m",
-                        "_z": "m",
-                        "_qx": "1",
-                        "_qy": "1",
-                        "_qz": "1",
-                        "_qw": "1",
-                    },
-                    3,
-                )
+                parts = {
+                    "_x": "m",
+                    "_y": "m",
+                    "_z": "m",
+                    "_qx": "1",
+                    "_qy": "1",
+                    "_qz": "1",
+                    "_qw": "1",
+                }
+                direct = 3
                 quaternions.append((i + 3, j + 3))
             elif kind in _UNBOUNDED:
                 parts = {"": "rad"}
@@ -142,12 +136,10 @@ class Coordinates:
         for move in self.moves:
             (self.lengths if move.slides else self.turns)[move.coordinate] += abs(move.factor)
         self._joint_count = int(model.njoints)
-        self._plain, self._angles, self._quaternions, self._runs = (
-            plain,
-            angles,
-            quaternions,
-            _merge_into_slices(plain),
-        )
+        self._plain = plain
+        self._angles = angles
+        self._quaternions = quaternions
+        self._runs = _merge_into_slices(plain)
 
     @property
     def followers(self) -> tuple[MovedJoint, ...]:
@@ -166,10 +158,8 @@ class Coordinates:
             coordinate_of = {model.joints[joint].idx_q: k for k, joint in enumerate(self.joints)}
             # Pinocchio 4.1 may order `mimicked_joints` and `mimicking_joints` differently.
             for joint in followers:
-                mimic_joint, axis = (
-                    model.joints[joint].extract(),
-                    np.asarray(data.joints[joint].S, float).ravel(),
-                )
+                mimic_joint = model.joints[joint].extract()
+                axis = np.asarray(data.joints[joint].S, float).ravel()
                 factor, offset = float(mimic_joint.scaling), float(mimic_joint.offset)
                 moves.append(
                     MovedJoint(

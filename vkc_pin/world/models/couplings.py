@@ -89,11 +89,9 @@ def find_followers(root: ElementTree.Element) -> dict[str, JointCoupling]:
 
 def check_followers(full: pin.Model, file: UrdfFile, tool_frame: str) -> None:
     """Check that the leaders of all joints on the path to the tool exist and can move."""
-    mimics, movable, found = (
-        _read_mimics(file.root),
-        _find_movable_joints(file.root),
-        find_followers(file.root),
-    )
+    mimics = _read_mimics(file.root)
+    movable = _find_movable_joints(file.root)
+    found = find_followers(file.root)
     leaders = {coupling.leader for coupling in found.values()}
     for joint in (str(full.names[j]) for j in find_joint_path(full, tool_frame)):
         if joint in mimics and joint in movable and joint not in found and joint not in leaders:
@@ -121,10 +119,8 @@ def find_coupled_groups(
     full: pin.Model, file: UrdfFile, tool_frame: str
 ) -> dict[str, dict[str, JointCoupling]]:
     """Return leader → its followers, for all groups with a joint on the path to the tool."""
-    follows, path = (
-        find_followers(file.root),
-        {str(full.names[j]) for j in find_joint_path(full, tool_frame)},
-    )
+    follows = find_followers(file.root)
+    path = {str(full.names[j]) for j in find_joint_path(full, tool_frame)}
     groups: dict[str, dict[str, JointCoupling]] = {}
     for joint, coupling in follows.items():
         if coupling.factor:
@@ -167,9 +163,8 @@ def apply_couplings(
 def find_joint_path(full: pin.Model, frame: str) -> list[int]:
     """Return the indices of the joints from the world to a frame of a robot."""
     named = [other for other in full.frames if other.name == frame]
-    link = next(
-        (other for other in named if other.type == pin.FrameType.BODY), named[0]
-    )  # prefer a link over a joint of the same name
+    # A link is preferred over a joint of the same name.
+    link = next((other for other in named if other.type == pin.FrameType.BODY), named[0])
     return list(full.supports[link.parentJoint])
 
 
@@ -303,10 +298,8 @@ def tighten_coupled_limits(full: pin.Model, file: UrdfFile, tool_frame: str) -> 
             common_low = max(low, lower[index])
             common_high = min(high, upper[index])
             if common_low > common_high + LIMIT_SLACK:
-                problem, expected = (
-                    f"no position satisfies the limits of its follower '{joint}'",
-                    f"limits that overlap {low:g} to {high:g}",
-                )
+                problem = f"no position satisfies the limits of its follower '{joint}'"
+                expected = f"limits that overlap {low:g} to {high:g}"
                 got = f"{lower[index]:g} to {upper[index]:g}"
                 raise InputError(problem, file=file.path, field=leader, expected=expected, got=got)
             if common_low >= common_high and lower[index] < upper[index]:
@@ -347,21 +340,17 @@ def apply_robot_limits(
     velocity, acceleration = np.full(model.nv, np.inf), np.full(model.nv, np.inf)
     velocity[:3], acceleration[:3] = settings.base.velocity, settings.base.acceleration
     coordinates = Coordinates(model)
-    unit_rates = coordinates.compute_max_steps(
-        1.0, 1.0
-    )  # at which the fastest joint moves at 1 m/s or 1 rad/s
+    # Rates at which the fastest joint moves at 1 m/s or 1 rad/s.
+    unit_rates = coordinates.compute_max_steps(1.0, 1.0)
     default_velocity = coordinates.compute_max_steps(DEFAULT_SLIDE_VELOCITY, DEFAULT_JOINT_VELOCITY)
     for move in coordinates.moves[3:]:
         name, k, factor = model.names[move.joint], move.coordinate, abs(move.factor)
-        joint_settings, urdf_velocity = (
-            settings.joints.get(name),
-            float(full.velocityLimit[full.joints[full.getJointId(name)].idx_v]),
-        )
+        joint_settings = settings.joints.get(name)
+        urdf_velocity = float(full.velocityLimit[full.joints[full.getJointId(name)].idx_v])
         if joint_settings is not None and joint_settings.velocity is not None:
             velocity[k] = min(velocity[k], joint_settings.velocity / factor)
-        elif (
-            0.0 < urdf_velocity < 1e3
-        ):  # Pinocchio stores the largest float for joints without a limit
+        # Pinocchio stores the largest float for joints without a limit.
+        elif 0.0 < urdf_velocity < 1e3:
             velocity[k] = min(velocity[k], urdf_velocity / factor)
         if joint_settings is not None and joint_settings.acceleration is not None:
             acceleration[k] = min(acceleration[k], joint_settings.acceleration / factor)
@@ -369,10 +358,8 @@ def apply_robot_limits(
     acceleration = np.where(
         np.isinf(acceleration), _DEFAULT_JOINT_ACCELERATION * unit_rates, acceleration
     )
-    model.velocityLimit, model.effortLimit = (
-        velocity,
-        _read_torque_limits(model, coordinates, settings),
-    )
+    model.velocityLimit = velocity
+    model.effortLimit = _read_torque_limits(model, coordinates, settings)
     lower, upper = coordinates.lower.copy(), coordinates.upper.copy()
     if base == "fixed":
         lower[:3] = upper[:3] = 0.0
@@ -397,18 +384,14 @@ def _bound_continuous_joints(full: pin.Model, joints: Set[str]) -> pin.Model:
     model.name = full.name
     pin.forwardKinematics(full, data, pin.neutral(full))
     for j in range(1, full.njoints):
-        joint, name, limits = (
-            full.joints[j],
-            str(full.names[j]),
-            (full.lowerPositionLimit, full.upperPositionLimit),
-        )
+        joint = full.joints[j]
+        name = str(full.names[j])
+        limits = (full.lowerPositionLimit, full.upperPositionLimit)
         parts = [bound[joint.idx_q : joint.idx_q + joint.nq] for bound in limits]
         if name in joints and joint.nq == 2:
             axis = np.asarray(data.joints[j].S, float).ravel()[3:]
-            joint, parts = (
-                pin.JointModelRevoluteUnaligned(axis),
-                [np.array([-np.inf]), np.array([np.inf])],
-            )
+            joint = pin.JointModelRevoluteUnaligned(axis)
+            parts = [np.array([-np.inf]), np.array([np.inf])]
         v = slice(full.joints[j].idx_v, full.joints[j].idx_v + full.joints[j].nv)
         model.addJoint(
             full.parents[j],

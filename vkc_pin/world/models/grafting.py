@@ -131,11 +131,9 @@ def graft_geometry(
     for original in objects:
         local = original.placement if original.parentJoint else placement * original.placement
         copy = pin.GeometryObject(original)
-        copy.name, copy.parentJoint, copy.parentFrame = (
-            prefix + original.name,
-            joints[original.parentJoint],
-            0,
-        )
+        copy.name = prefix + original.name
+        copy.parentJoint = joints[original.parentJoint]
+        copy.parentFrame = 0
         copy.placement = local
         added.append(geometry.addGeometryObject(copy))
     return added

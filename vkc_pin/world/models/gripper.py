@@ -264,10 +264,8 @@ def build_gripper(
     """
     if not stated:
         return None
-    follows, palm = (
-        find_followers(file.root),
-        list(full.supports[full.frames[full.getFrameId(tool_frame)].parentJoint]),
-    )
+    follows = find_followers(file.root)
+    palm = list(full.supports[full.frames[full.getFrameId(tool_frame)].parentJoint])
     arm = max(j for j in palm if full.names[j] in list(model.names))
     for joint, finger in stated.items():
         where = ("gripper", joint)
@@ -302,10 +300,8 @@ def build_gripper(
         if name in stated or (name in follows and follows[name].leader in stated)
     ]
     names = tuple(sorted(finger_joints, key=full.getJointId))
-    unlocked, shapes = (
-        build_unlocked_model(full, file, model, names, rest, height),
-        pin.GeometryModel(),
-    )
+    unlocked = build_unlocked_model(full, file, model, names, rest, height)
+    shapes = pin.GeometryModel()
     for shape in _attach_shapes(list(collision.geometryObjects), model, unlocked):
         shapes.addGeometryObject(shape)
 

@@ -116,10 +116,8 @@ class AttachmentSchema(Schema):
             and self.closing is not None
             and abs(np.dot(self.approach, self.closing)) > 1e-9
         )
-        has_axis, axis = (
-            self.joint in ("revolute", "prismatic", "cylindrical"),
-            "joint revolute, prismatic or cylindrical",
-        )
+        has_axis = self.joint in ("revolute", "prismatic", "cylindrical")
+        axis = "joint revolute, prismatic or cylindrical"
         is_cylindrical = self.joint == "cylindrical"
         names = [freedom.name for freedom in self.freedoms]
         for is_invalid, problem, expected in (
@@ -234,14 +232,10 @@ def build_object(document: Document, folder: Path, name: str | None = None) -> A
     with document.annotate_errors(("urdf",)):
         model, collision, visual = load_urdf(urdf, text=text)
         coordinates = Coordinates(model)
-    names, links = (
-        coordinates.names,
-        [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY],
-    )
-    velocity, acceleration = (
-        coordinates.velocity.copy(),
-        np.full(coordinates.size, DEFAULT_ACCELERATION),
-    )
+    names = coordinates.names
+    links = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
+    velocity = coordinates.velocity.copy()
+    acceleration = np.full(coordinates.size, DEFAULT_ACCELERATION)
     velocity[np.isinf(velocity)] = DEFAULT_VELOCITY
     for joint, limits in schema.joints.items():
         if joint not in names:
@@ -255,10 +249,8 @@ def build_object(document: Document, folder: Path, name: str | None = None) -> A
         raise InputError(problem, file=urdf, field=field, expected="> 0", got=velocity.min())
     if schema.mass is not None:
         if not schema.free:
-            problem, expected = (
-                "`mass` applies to free objects only",
-                "masses of links in its URDF, or free: true",
-            )
+            problem = "`mass` applies to free objects only"
+            expected = "masses of links in its URDF, or free: true"
             raise document.make_error(("mass",), problem, expected=expected, got=schema.mass)
         set_mass(model, collision, schema.mass)
     attachments: dict[str, Attachment] = {}

@@ -113,11 +113,9 @@ class Robot:
         Searches use it to weigh rotations against translations of the base. All rotations have the
         same weight: with cheaper wrist rotations, searches would find long ones.
         """
-        rng, data, frame = (
-            np.random.default_rng(0),
-            self.model.createData(),
-            self.model.getFrameId(self.tool_frame),
-        )
+        rng = np.random.default_rng(0)
+        data = self.model.createData()
+        frame = self.model.getFrameId(self.tool_frame)
         turns = [k for k, unit in enumerate(self.coordinates.units) if k > 2 and unit == "rad"]
         if not turns:
             return _MIN_LEVER
@@ -198,9 +196,9 @@ class Robot:
         digest.update(repr((self.coordinates.names, list(self.model.parents))).encode())
         for values in (self.lower, self.upper, self.home):
             digest.update(np.asarray(values, float).tobytes())
-        for z in np.random.default_rng(0).uniform(
-            -3.0, 3.0, (3, len(self.lower))
-        ):  # captures axes and placements of joints
+        # Placements at three configurations capture axes and placements of joints.
+        configurations = np.random.default_rng(0).uniform(-3.0, 3.0, (3, len(self.lower)))
+        for z in configurations:
             pin.forwardKinematics(self.model, data, self.coordinates.q(z))
             digest.update(np.array([place.homogeneous for place in data.oMi]).tobytes())
         for shape in self.collision.geometryObjects:

@@ -207,10 +207,8 @@ def load_robot(  # noqa: PLR0913 - keyword options of a public call
     if unstated := ", ".join(joint for joint in base_joints if joint not in stated_positions):
         problem = "the virtual base replaces the joints of the robot's base, which are locked"
         warnings.warn(f"{urdf.path}: {problem}: {unstated}", stacklevel=2)
-    root_height, rest = (
-        settings.base.height if height is None else check_coordinate(height, "height"),
-        {**rest, **locked},
-    )
+    root_height = settings.base.height if height is None else check_coordinate(height, "height")
+    rest = {**rest, **locked}
     model = build_planned_model(full, urdf, tool, rest, locked, height=root_height)
     coordinates, lower, upper, velocity, acceleration = apply_robot_limits(
         full, model, settings, base
@@ -229,9 +227,10 @@ def load_robot(  # noqa: PLR0913 - keyword options of a public call
         upper=upper,
         velocity=velocity,
         acceleration=acceleration,
+        # Clipping removes rounding errors.
         home=np.clip(
             [{**rest, **state}[joint] for joint in coordinates.names[3:]], lower[3:], upper[3:]
-        ),  # removes rounding errors
+        ),
         tool_frame=tool,
         base=base,
         touch_links=settings.touch_links,

@@ -82,11 +82,9 @@ def build_planned_model(
         for joint, coupling in group.items()
         if joint in locked
     ]:
-        problem, (joint, leader), expected = (
-            "a locked joint follows one that is not locked",
-            stuck_joints[0],
-            "the joint that it follows in `locked_joints`",
-        )
+        problem = "a locked joint follows one that is not locked"
+        joint, leader = stuck_joints[0]
+        expected = "the joint that it follows in `locked_joints`"
         raise InputError(
             problem,
             file=file.path,
@@ -280,10 +278,8 @@ def find_default_tool_frame(full: pin.Model, file: UrdfFile) -> str:
         hand = len(children[joint]) > 1 and depth[joint] <= _MAX_FINGER_JOINTS
         if hand and joint_count >= _MIN_ARM_JOINTS:
             break
-        joint, joint_count = (
-            max(children[joint], key=lambda j: depth[j] + (full.joints[j].nv == 1)),
-            joint_count + 1,
-        )
+        joint = max(children[joint], key=lambda j: depth[j] + (full.joints[j].nv == 1))
+        joint_count = joint_count + 1
     return str(
         [
             frame.name

@@ -48,10 +48,9 @@ HOME_DISTANCE = 0.02
 _DESCENT_STARTS, _DESCENT_STEPS = 4, 200  # descents per pair of links, and steps of each
 # [m] equal to the resolution of validation: links that never get further apart count as touching
 _CONTACT_DISTANCE = 1e-3
-_HOME_SEARCH_RADII, _HOME_SEARCH_SAMPLES = (
-    (0.05, 0.1, 0.2, 0.4, 0.7, 1.0),
-    100,
-)  # fractions of the joint ranges, and samples in each
+# Fractions of the joint ranges in which a home is searched in turn, and samples in each
+_HOME_SEARCH_RADII = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0)
+_HOME_SEARCH_SAMPLES = 100
 
 
 class SelfCollisionAnalysis(NamedTuple):
@@ -90,10 +89,8 @@ def apply_self_collision_analysis(
     an SRDF (`semantics`), pairs are sampled.
     """
     listed = None if semantics is None else semantics.allowed
-    found, names = (
-        analyze_self_collisions(robot, listed, loose, samples=samples),
-        robot.coordinates.names[3:],
-    )
+    found = analyze_self_collisions(robot, listed, loose, samples=samples)
+    names = robot.coordinates.names[3:]
     home, message = np.array(found.home), f"{robot.urdf}: "
     if moved := [
         f"{name}: {value:.3g}"
@@ -174,22 +171,16 @@ def sample_allowed_pairs(
         samples: Number of random configurations.
         seed: Random seed.
     """
-    groups, (adjacent, adjacent_bodies) = (
-        _group_shape_pairs(robot),
-        find_neighbours(robot.file, robot.links),
-    )
+    groups = _group_shape_pairs(robot)
+    adjacent, adjacent_bodies = find_neighbours(robot.file, robot.links)
     allowed = {links: "Adjacent" for links in groups if links in adjacent}
     groups = {links: parts for links, parts in groups.items() if links not in adjacent}
-    rng, distances, (low, high) = (
-        np.random.default_rng(seed),
-        _make_shape_distances(robot),
-        _find_sampling_bounds(robot),
-    )
-    link_distances, undecided, (free, hit) = (
-        LinkDistances(distances, groups),
-        np.arange(len(groups)),
-        np.zeros((2, len(groups)), bool),
-    )
+    rng = np.random.default_rng(seed)
+    distances = _make_shape_distances(robot)
+    low, high = _find_sampling_bounds(robot)
+    link_distances = LinkDistances(distances, groups)
+    undecided = np.arange(len(groups))
+    free, hit = np.zeros((2, len(groups)), bool)
     closest: list[list[tuple[float, tuple[float, ...]]]] = [[] for _ in groups]
     for z in rng.uniform(low, high, (samples, len(low))):
         distances.set_configuration(z)
@@ -278,11 +269,9 @@ def _find_free_home(
     robot: Robot, groups: Mapping[Pair, Parts], loose: Collection[str]
 ) -> tuple[float, ...]:
     """Return the robot's home, or one with fewer overlaps that differs in `loose` joints only."""
-    distances, (low, high), rng = (
-        _make_shape_distances(robot),
-        _find_sampling_bounds(robot),
-        np.random.default_rng(0),
-    )
+    distances = _make_shape_distances(robot)
+    low, high = _find_sampling_bounds(robot)
+    rng = np.random.default_rng(0)
     is_loose = np.array([name in loose for name in robot.coordinates.names])
     default_home = np.array([0.0, 0.0, 0.0, *robot.home])
 
@@ -338,11 +327,9 @@ def _compute_max_distances(
     robot: Robot, groups: Mapping[Pair, Parts], samples: int
 ) -> dict[Pair, float]:
     """Return the largest distances at home and in samples [m]; above 50 mm, lower bounds."""
-    distances, (low, high), rng = (
-        _make_shape_distances(robot),
-        _find_sampling_bounds(robot),
-        np.random.default_rng(0),
-    )
+    distances = _make_shape_distances(robot)
+    low, high = _find_sampling_bounds(robot)
+    rng = np.random.default_rng(0)
     link_distances, max_distances = LinkDistances(distances, groups), dict.fromkeys(groups, -np.inf)
     for z in (np.array([0.0, 0.0, 0.0, *robot.home]), *rng.uniform(low, high, (samples, len(low)))):
         if not link_distances.links:
@@ -365,10 +352,8 @@ def _compute_max_distances(
 
 def _find_sampling_bounds(robot: Robot) -> tuple[Floats, Floats]:
     """Return lower and upper bounds of sampled configurations, shape (n,) each [m], [rad]."""
-    low, high = (
-        np.where(np.isfinite(robot.lower), robot.lower, -np.pi),
-        np.where(np.isfinite(robot.upper), robot.upper, np.pi),
-    )
+    low = np.where(np.isfinite(robot.lower), robot.lower, -np.pi)
+    high = np.where(np.isfinite(robot.upper), robot.upper, np.pi)
     low[:3] = high[:3] = 0.0
     return low, high
 

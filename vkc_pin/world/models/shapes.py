@@ -72,12 +72,10 @@ def check_start_value(value: float, lower: float, upper: float, field: str | Non
 def copy_shape(shape: pin.GeometryObject, name: str, placement: pin.SE3) -> pin.GeometryObject:
     """Return a copy of `shape` that is fixed at `placement` in the world frame."""
     copy = pin.GeometryObject(shape)
-    copy.name, copy.parentJoint, copy.parentFrame, copy.placement = (
-        name,
-        0,
-        0,
-        round_placement(placement),
-    )
+    copy.name = name
+    copy.parentJoint = 0
+    copy.parentFrame = 0
+    copy.placement = round_placement(placement)
     return copy
 
 
@@ -291,10 +289,8 @@ class LinkDistances:
     def __init__(
         self, distances: ShapeDistances, groups: Mapping[tuple[str, str], Sequence[tuple[int, int]]]
     ) -> None:
-        self._distances, self._groups = (
-            distances,
-            {links: np.array(parts, np.int64) for links, parts in groups.items()},
-        )
+        self._distances = distances
+        self._groups = {links: np.array(parts, np.int64) for links, parts in groups.items()}
         self._concatenate_pairs()
 
     def select(self, chosen: Sequence[bool] | Bools) -> None:

@@ -319,10 +319,8 @@ class PlacedShapes:
     """
 
     def __init__(self, scene: _Scene, objects: Mapping[str, PlacedObject]) -> None:
-        self.scene, self.objects = (
-            scene,
-            {n: p for n, p in objects.items() if not (p.object.free and n in scene.held)},
-        )
+        self.scene = scene
+        self.objects = {n: p for n, p in objects.items() if not (p.object.free and n in scene.held)}
         self._shapes, self.labels = list[pin.GeometryObject](), list[str]()
         for name, placed in self.objects.items():
             shapes = make_world_shapes(placed)

@@ -464,10 +464,8 @@ def warn_of_openings(
             if abs(robot.gripper.clamp_opening(opening) - opening) > _ROUNDING
         }
         for what, opening in beyond.items():
-            can, nearest = (
-                f"{1e3 * least:.1f} to {1e3 * most:.1f} mm",
-                1e3 * robot.gripper.clamp_opening(opening),
-            )
+            can = f"{1e3 * least:.1f} to {1e3 * most:.1f} mm"
+            nearest = 1e3 * robot.gripper.clamp_opening(opening)
             text = f"the gripper of '{robot.name}' opens from {can}"
             text += f", not {1e3 * opening:g} mm as requested for {what}"
             warnings.warn(f"{where}: {text}: it opens to {nearest:.1f} mm", stacklevel=4)

@@ -411,10 +411,8 @@ class Scene:
                 "not a number", field="reach", expected="a distance [m]", got=format_value(reach)
             )
         reach = float(min(reach, 1e300))
-        model, geometry = (
-            self.robot.model,
-            self.robot.opened(self.robot.opening(self.opening)).collision,
-        )
+        model = self.robot.model
+        geometry = self.robot.opened(self.robot.opening(self.opening)).collision
         data, shapes = model.createData(), geometry.createData()
         pin.updateGeometryPlacements(
             model, data, geometry, shapes, self.robot.coordinates.q(self.start)

@@ -112,10 +112,8 @@ def make_document(fields: Mapping[str, Any]) -> dict[str, Any]:
         held[hold.object] = {key: value for key, value in entries.items() if value is not None}
     for item, entry in zip(described.objects, plain["objects"], strict=True):
         placed = objects[item.name]
-        names, neutral = (
-            placed.object.coordinates.names,
-            np.clip(0.0, placed.object.lower, placed.object.upper),
-        )
+        names = placed.object.coordinates.names
+        neutral = np.clip(0.0, placed.object.lower, placed.object.upper)
         entry["state"] = dict(zip(names, placed.state.tolist(), strict=True))
         in_hand = placed.object.free and item.name in held
         moved = not in_hand and not np.array_equal(
@@ -260,10 +258,8 @@ def _make_holds(
         with document.annotate_errors(path):
             owner = by.get(name, "").partition(".")[0]
             both = {one: attachments[one] for one in (owner, name) if one in held}
-            through, values = (
-                {name: by[name]} if name in by else {},
-                {name: at[name]} if name in at else {},
-            )
+            through = {name: by[name]} if name in by else {}
+            values = {name: at[name]} if name in at else {}
             resolve_holds(objects, make_holds(both, through, values))
     with document.annotate_errors(("start", "held")):
         holds = make_holds(attachments, by, at)

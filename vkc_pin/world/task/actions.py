@@ -53,11 +53,9 @@ def generate_alternatives(task: Task) -> Iterator[tuple[str, tuple[Step, ...]]]:
     """
     if len(task.open_attachments) == 1:
         (grasp,) = task.open_attachments
-        before, step, after = (
-            task.steps[: grasp.step],
-            task.steps[grasp.step],
-            task.steps[grasp.step + 1 :],
-        )
+        before = task.steps[: grasp.step]
+        step = task.steps[grasp.step]
+        after = task.steps[grasp.step + 1 :]
         for name in grasp.others:
             yield f"{grasp.object}.{name}", (*before, _name_attachment(step, name), *after)
 

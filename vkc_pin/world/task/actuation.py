@@ -52,9 +52,8 @@ def compute_advance(
     model, data = placed.object.model, placed.object.model.createData()
     frame, index = placed.object.link_frame(attachment.link), model.getJointId(joint)
     q = placed.object.coordinates.q(placed.state)
-    jacobian = pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL).reshape(
-        6, -1
-    )  # Pinocchio returns a vector for a single joint.
+    # Pinocchio returns a vector for a single joint.
+    jacobian = pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL).reshape(6, -1)
     column = jacobian[:, model.joints[index].idx_v]
     into = attachment.placement.rotation[:, 2]
     found = [
@@ -183,10 +182,8 @@ def check_actuation(
             expected = f"one of {', '.join(path)}" if path else "an attachment that moves with it"
             raise InputError(problem, field=f"{where}.joints", expected=expected)
     joints = zip(placed.object.coordinates.names, placed.state.tolist(), strict=True)
-    state, wanted = (
-        {f"{name}.{joint}": value for joint, value in joints} | dict(state),
-        dict(values),
-    )
+    state = {f"{name}.{joint}": value for joint, value in joints} | dict(state)
+    wanted = dict(values)
     for latch in find_blocking_latches(placed, state, wanted):
         release = f"{name}.{latch.released_by}"
         if latch.released_by in path:

@@ -249,10 +249,10 @@ class _Compiler:
             if one in used or find_shared_coordinate(self.scene, (one, hold)) is None
         ]
         if len(used_holds) < len(self.holds):
-            self.holds, remaining = (
-                used_holds,
-                {name for one in used_holds for name in find_driven_coordinates(self.scene, one)},
-            )
+            self.holds = used_holds
+            remaining = {
+                name for one in used_holds for name in find_driven_coordinates(self.scene, one)
+            }
             for values in (self.initial, self.state):
                 for name in values.keys() - remaining:
                     del values[name]

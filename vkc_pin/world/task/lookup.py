@@ -101,10 +101,8 @@ def compute_openings(scene: Scene, phases: Sequence[Phase]) -> list[float | None
     It is the opening of the attachment that the gripper holds or grasps next; after the last grasp
     it does not change.
     """
-    gripper_holds, found = (
-        [find_gripper_hold((*phase.held, *phase.grasps)) for phase in phases],
-        list[float | None](),
-    )
+    gripper_holds = [find_gripper_hold((*phase.held, *phase.grasps)) for phase in phases]
+    found = list[float | None]()
     for number in range(len(phases)):
         hold = next((one for one in gripper_holds[number:] if one is not None), None)
         before = found[-1] if found else compute_start_opening(scene)

@@ -175,10 +175,8 @@ def sample_curve(curve: Curve) -> MotionSamples:
     """Sample every cubic of a curve at its ends and middle, with its own accelerations there."""
     spans, count = np.diff(curve.times), len(curve.times) - 1
     times = sample_intervals(curve.times, _SHARES)
-    begin, middle = (
-        curve.acceleration(curve.times[:-1]),
-        curve.acceleration(curve.times[:-1] + 0.5 * spans),
-    )
+    begin = curve.acceleration(curve.times[:-1])
+    middle = curve.acceleration(curve.times[:-1] + 0.5 * spans)
     accelerations = begin[:, None] + 2.0 * _SHARES[None, :, None] * (middle - begin)[:, None]
     return MotionSamples(
         times,

@@ -70,10 +70,8 @@ class Trajectory:
             check_text(name, f"Trajectory.names[{k}]", "a name") for k, name in enumerate(listed)
         )
         phases = check_list(self.phases, "Trajectory.phases", "a list of PhaseSpan", PhaseSpan)
-        times, positions = (
-            check_finite_array(self.times, "Trajectory.times"),
-            check_finite_array(self.positions, "Trajectory.positions"),
-        )
+        times = check_finite_array(self.times, "Trajectory.times")
+        positions = check_finite_array(self.positions, "Trajectory.positions")
         counts = Counter(names)
         if (twice := next((name for name in names if counts[name] > 1), None)) is not None:
             raise InputError("a name occurs twice", field="Trajectory.names", got=twice)

@@ -104,11 +104,9 @@ class Camera:
         ahead = (target - position) / np.linalg.norm(target - position)
         right = np.cross(ahead, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
-        self.axes, self.position, self.size = (
-            np.array([right, np.cross(ahead, right), ahead]),
-            position,
-            size,
-        )
+        self.axes = np.array([right, np.cross(ahead, right), ahead])
+        self.position = position
+        self.size = size
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return pixel columns and rows, shape (..., 2), and depths along the view [m]."""

@@ -183,10 +183,8 @@ def furniture_picture() -> None:
                 )
             )
             corners = np.array(faces).reshape(-1, 3)
-            middle, half = (
-                (corners.max(axis=0) + corners.min(axis=0)) / 2,
-                np.ptp(corners, axis=0).max() / 2,
-            )
+            middle = (corners.max(axis=0) + corners.min(axis=0)) / 2
+            half = np.ptp(corners, axis=0).max() / 2
             for axis, value in zip("xyz", middle, strict=True):
                 getattr(axes, f"set_{axis}lim")(value - half, value + half)
             axes.view_init(elev=22, azim=-145)
@@ -286,10 +284,8 @@ def push_picture() -> None:
 
 def bases_picture() -> None:
     """Draw the door opened by a differential drive and by a car-like base, seen from above."""
-    scene, shown = (
-        vkc.load_scene("door"),
-        ({"base": "differential"}, {"base": "ackermann", "turning_radius": 0.8}),
-    )
+    scene = vkc.load_scene("door")
+    shown = ({"base": "differential"}, {"base": "ackermann", "turning_radius": 0.8})
     with use_style():
         figure = new_figure(11.0, 3.5)
         parts = figure.subfigures(1, 2)
@@ -376,10 +372,8 @@ def torque_picture() -> None:
             panels, plans, ("as it is", "with a closer that damps by 400 N·m·s/rad"), strict=True
         ):
             times, _ = plan.trajectory.sample(200.0)
-            torques, limits = (
-                Torques(plan.scene, plan.trajectory),
-                plan.scene.robot.efforts.limits[3:],
-            )
+            torques = Torques(plan.scene, plan.trajectory)
+            limits = plan.scene.robot.efforts.limits[3:]
             shares = 100.0 * torques.along(times)[:, 3:] / limits
             for name, column, limit in zip(
                 plan.scene.robot.coordinates.names[3:], shares.T, limits, strict=True

@@ -209,10 +209,8 @@ def evidence() -> str:
         minutes = sum(session["seconds"] for session in sessions) / 60.0
         timed = sum(session["trials"] for session in sessions)
         if not sessions:  # of the door, whose record has no sessions
-            minutes, jobs = (
-                sum(trial["planning_time"] + trial["build_time"] for trial in trials) / 60.0,
-                "planning alone",
-            )
+            minutes = sum(trial["planning_time"] + trial["build_time"] for trial in trials) / 60.0
+            jobs = "planning alone"
         for option in entry.get("options", ()):
             values = about[option] if isinstance(about[option], list) else [str(about[option])]
             command += (

@@ -38,11 +38,9 @@ class Link(NamedTuple):
 # A finger's tip is a piece of its own: the hull of a whole finger would reach far into the opening
 # between the pads.
 _FINGER = Link(groups=((0, 1, 2), (3, 4)))
-_BODY, _LEFT_WHEELS, _RIGHT_WHEELS = (
-    (0, 1, 2, 5, 6, 7, 8, 9, 10, 11),
-    (3, 12, 14, 16, 18),
-    (4, 13, 15, 17, 19),
-)
+_BODY = (0, 1, 2, 5, 6, 7, 8, 9, 10, 11)
+_LEFT_WHEELS = (3, 12, 14, 16, 18)
+_RIGHT_WHEELS = (4, 13, 15, 17, 19)
 ROBOTS = {
     "husky_ur5e": {
         "ur_base_link_inertia": Link(),
@@ -92,14 +90,10 @@ def main() -> None:
             write_atomically(
                 folder / "collision" / f"{link}_{k}.stl", piece.export(file_type="stl")
             )
-        solid, union = (
-            solid_volume(meshes, pitch=links[link].pitch),
-            solid_volume(pieces, pitch=0.002),
-        )
-        corners, excess = (
-            ", ".join(str(len(piece.vertices)) for piece in pieces),
-            100 * (union / solid - 1),
-        )
+        solid = solid_volume(meshes, pitch=links[link].pitch)
+        union = solid_volume(pieces, pitch=0.002)
+        corners = ", ".join(str(len(piece.vertices)) for piece in pieces)
+        excess = 100 * (union / solid - 1)
         print(
             f"| `{link}` | {len(pieces)} | {corners} | {1e3 * solid:.3f} "
             f"| {1e3 * union:.3f} | {excess:.0f} % |",

@@ -112,10 +112,8 @@ def test_dataset_keeps_its_terms(dataset: Dataset) -> None:
 
 def test_terms_apply_only_to_their_tasks(dataset: Dataset) -> None:
     tasks, limit = ["given-open", "drive-open"], {**SPEED_LIMIT, "tasks": ["drive-open"]}
-    recipe, episode = (
-        load_recipe({**SMALL, "tasks": tasks, "terms": [limit]}),
-        next(dataset.episodes()),
-    )
+    recipe = load_recipe({**SMALL, "tasks": tasks, "terms": [limit]})
+    episode = next(dataset.episodes())
     counts = [
         len(resolve_episode_terms(recipe, episode.scene(), {**episode.about, "task": task}))
         for task in tasks

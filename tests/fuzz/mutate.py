@@ -220,10 +220,8 @@ def choose_changes(
     paths = [path for path in iterate_paths(data) if path]
     changes: list[list[Any]] = []
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
-        path, operation = (
-            rng.choice(paths),
-            rng.choice(("set", "set", "set", "remove", "rename", "copy", "double")),
-        )
+        path = rng.choice(paths)
+        operation = rng.choice(("set", "set", "set", "remove", "rename", "copy", "double"))
         operand: Any = rng.choice(values)
         if operation == "copy":
             operand = list(rng.choice(paths))

@@ -42,11 +42,9 @@ def compute_all_distances(table: PairTable, z: np.ndarray) -> np.ndarray:
     geometry = table.world.collision.copy()
     for first, second in table.pairs.tolist():
         geometry.addCollisionPair(pin.CollisionPair(first, second))
-    model, data, shapes = (
-        table.world.model,
-        table.world.model.createData(),
-        pin.GeometryData(geometry),
-    )
+    model = table.world.model
+    data = table.world.model.createData()
+    shapes = pin.GeometryData(geometry)
     out = np.empty((len(z), len(table.pairs)))
     for row, q in enumerate(table.world.coordinates.q(z)):
         pin.updateGeometryPlacements(model, data, geometry, shapes, q)

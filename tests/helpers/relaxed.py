@@ -81,11 +81,9 @@ def check_relaxation(problem: TrajectoryProblem, z: np.ndarray) -> dict[str, flo
     exact. In between, violations are proportional.
     """
     t, at = problem.transcription, RelaxedProgram(problem, z)
-    raw, residual, fractions = (
-        at.rows(0.0),
-        at.violations(at.rows(1.0)),
-        np.random.default_rng(21).uniform(0.1, 0.9, t.segments),
-    )
+    raw = at.rows(0.0)
+    residual = at.violations(at.rows(1.0))
+    fractions = np.random.default_rng(21).uniform(0.1, 0.9, t.segments)
     assert np.isfinite(raw).all()
     assert residual.max() < 1e-8 * max(1.0, np.abs(raw).max())
     terms = problem.term_evaluator.compute_cost(z, at.timing.dt)

@@ -23,10 +23,8 @@ ROBOT = ("base_x", "base_y", "base_yaw", "lift", "elbow")
 @st.composite
 def trajectories(draw: st.DrawFn, largest: float | None = None) -> Trajectory:
     """Return trajectories of robots with up to five coordinates that grasp and carry objects."""
-    robot, objects = (
-        draw(st.integers(3, 5)),
-        draw(st.lists(st.sampled_from("abcde"), max_size=4, unique=True)),
-    )
+    robot = draw(st.integers(3, 5))
+    objects = draw(st.lists(st.sampled_from("abcde"), max_size=4, unique=True))
     names = (*ROBOT[:robot], *(f"{name}.joint" for name in objects))
     steps = draw(st.lists(st.floats(1e-3, 1e3), min_size=1, max_size=8))
     times = draw(st.floats(-1e3, 1e3)) + np.cumsum([0.0, *steps])
@@ -44,10 +42,8 @@ def trajectories(draw: st.DrawFn, largest: float | None = None) -> Trajectory:
     )
     cuts = sorted(draw(st.sets(st.integers(1, len(steps)))) | {len(steps)})
     label, phases, first = st.text(st.characters(exclude_categories=["Cs"]), max_size=6), [], 0
-    name, link = (
-        st.text(st.characters(exclude_categories=["Cs"], exclude_characters="."), max_size=6),
-        label.filter(bool),
-    )
+    name = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="."), max_size=6)
+    link = label.filter(bool)
     for last in cuts:
         held = list(draw(st.dictionaries(name, label, max_size=3)).items())
         holds: list[Hold] = []

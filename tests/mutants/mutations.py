@@ -182,10 +182,8 @@ def _change_comparisons(
     for k, operator in enumerate(node.ops):
         begin, end = text.get_span(sides[k])[1], text.get_span(sides[k + 1])[0]
         gap = text.bytes[begin:end]
-        begin, end = (
-            begin + len(gap) - len(gap.lstrip(b") ")),
-            end - (len(gap) - len(gap.rstrip(b"( "))),
-        )
+        begin = begin + len(gap) - len(gap.lstrip(b") "))
+        end = end - (len(gap) - len(gap.rstrip(b"( ")))
         yield "comparison", (begin, end), COMPARISONS[type(operator)]
         if type(operator) in REVERSED:
             yield "comparison", (begin, end), REVERSED[type(operator)]

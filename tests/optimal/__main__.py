@@ -41,10 +41,8 @@ def format_table(rows: list[dict[str, Any]]) -> str:
         duration, least = (
             sum(row[field] for row in own) / len(own) for field in ("duration", "least")
         )
-        worst, torque_bound = (
-            max(row["duration"] / row["least"] for row in own),
-            sum(row["heavy"] > 0 for row in own),
-        )
+        worst = max(row["duration"] / row["least"] for row in own)
+        torque_bound = sum(row["heavy"] > 0 for row in own)
         lines.append(
             f"| {task} | {len(own)} | {duration:.2f} | {least:.2f} | {worst:.3f} | {torque_bound} |"
         )

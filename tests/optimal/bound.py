@@ -24,12 +24,10 @@ def compute_bound(scene: Scene, motion: Trajectory, points: int = FINE) -> tuple
     The motion is retimed, which must reproduce its duration. TOPP-RA then solves every path of this
     retiming again, on a finer grid. Stops and rests are those of the motion.
     """
-    paths, rest_times, compute_speeds, make_straight_curve = (
-        dict[int, tuple[Any, ...]](),
-        list[float](),
-        retime.compute_speeds,
-        retime._make_straight_curve,
-    )
+    paths = dict[int, tuple[Any, ...]]()
+    rest_times = list[float]()
+    compute_speeds = retime.compute_speeds
+    make_straight_curve = retime._make_straight_curve
 
     def record_path(path: Any, places: Any, *limits: Any) -> Any:
         paths[id(path)] = (

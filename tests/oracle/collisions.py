@@ -122,10 +122,8 @@ def check_collisions(
     for i, one in enumerate(pairs.moving):
         arcs = pairs.compute_arcs(i)
         reach = np.maximum(arcs[:, ends] - arcs[:, middles], arcs[:, middles] - arcs[:, begins])
-        active, close = (
-            pairs.bound_fixed_distances(i, middles) < reach[0][:, None],
-            pairs.bound_fixed_distances(i, waypoints) < clearance,
-        )
+        active = pairs.bound_fixed_distances(i, middles) < reach[0][:, None]
+        close = pairs.bound_fixed_distances(i, waypoints) < clearance
         candidates = np.flatnonzero(active.any(axis=0) | close.any(axis=0))
         todo = [(pairs.fixed[k], arcs[0], active[:, k], close[:, k]) for k in candidates]
         for j, other in enumerate(pairs.moving[:i]):

@@ -203,10 +203,8 @@ def find_touched(world: World, stage: Stage) -> Iterator[tuple[set[str], set[str
 
 def check_goals(world: World, stages: list[Stage]) -> Iterator[Violation]:
     """Check that steps are completed in order at phase ends, and move no other object's joints."""
-    steps, ends = (
-        world.plan.steps,
-        [End(world, stages, number) for number in range(len(stages) + 1)],
-    )
+    steps = world.plan.steps
+    ends = [End(world, stages, number) for number in range(len(stages) + 1)]
     misses = [[find_misses(world, step, end) for end in ends] for step in steps]
     moved = [_find_moved_objects(world, stage) for stage in stages]
     actuated = [{step["object"]} if step["step"] == "Actuate" else set() for step in steps]

@@ -289,16 +289,12 @@ def _compute_wrenches(
         if supported
         else 0.0
     )
-    velocity, acceleration = (
-        (joint_rows[2] - joint_rows[0]) / (2.0 * h[:, None]),
-        (joint_rows[0] - 2.0 * joint_rows[1] + joint_rows[2]) / h[:, None] ** 2,
-    )
+    velocity = (joint_rows[2] - joint_rows[0]) / (2.0 * h[:, None])
+    acceleration = (joint_rows[0] - 2.0 * joint_rows[1] + joint_rows[2]) / h[:, None] ** 2
     latched = {latch["joint"]: latch["held_at"] for latch in obj.latches}
     for k, joint in enumerate(names):
-        resistance, moving = (
-            obj.resistances[joint],
-            np.where(np.abs(velocity[:, k]) > STILL, velocity[:, k], 0.0),
-        )
+        resistance = obj.resistances[joint]
+        moving = np.where(np.abs(velocity[:, k]) > STILL, velocity[:, k], 0.0)
         forces[:, k] += resistance["stiffness"] * (joint_rows[1][:, k] - resistance["springref"])
         forces[:, k] += resistance["damping"] * moving + resistance["friction"] * np.sign(moving)
         low, high = obj.limits[joint][:2]

@@ -87,11 +87,9 @@ class Curve:
             else cubics
         )
         h, since = np.diff(self.times)[k][:, None], (times - self.times[k])[:, None]
-        p, v, step = (
-            self.positions[k],
-            self.velocities[k],
-            self.positions[k + 1] - self.positions[k],
-        )
+        p = self.positions[k]
+        v = self.velocities[k]
+        step = self.positions[k + 1] - self.positions[k]
         c2 = (3.0 * step / h - 2.0 * v - self.velocities[k + 1]) / h
         c3 = (v + self.velocities[k + 1] - 2.0 * step / h) / h**2
         if order == 0:
@@ -171,10 +169,10 @@ def read_plan(path: Path) -> SavedPlan:
         folder = beside if beside.is_dir() else Path(location["absolute"])
     motion = metadata["trajectory"]
     start_grasps = (metadata["scene"]["start"].get("held") or {}).items()
-    holds, measured = (
-        [],
-        {name for name, hold in start_grasps if isinstance(hold, dict) and "measured" in hold},
-    )
+    holds = []
+    measured = {
+        name for name, hold in start_grasps if isinstance(hold, dict) and "measured" in hold
+    }
     for p in motion["phases"]:
         measured &= (p.get("deviation") or {}).keys()
         holds.append(sort_holds(p["held"], p.get("by") or {}, measured))

@@ -43,17 +43,13 @@ def check_motion(world: World) -> Iterator[Violation]:
             velocity = np.diff(column) / spans
             change = np.abs(np.diff(np.concatenate([[0.0], velocity, [0.0]])))  # from rest to rest
             shorter = np.minimum(np.append(spans, np.inf), np.append(np.inf, spans))
-            acceleration, acceleration_times, velocity_times = (
-                change / shorter,
-                plan.times,
-                plan.times,
-            )
+            acceleration = change / shorter
+            acceleration_times = plan.times
+            velocity_times = plan.times
         else:
             inside = plan.curve.sample_times(8)
-            number, acceleration_times = (
-                np.repeat(np.arange(len(inside)), inside.shape[1]),
-                inside.ravel(),
-            )
+            number = np.repeat(np.arange(len(inside)), inside.shape[1])
+            acceleration_times = inside.ravel()
             velocity, acceleration = (
                 np.abs(plan.curve.evaluate(acceleration_times, order, number)[:, k])
                 for order in (1, 2)
@@ -94,12 +90,10 @@ def _check_rolling(world: World) -> Iterator[Violation]:
     """
     plan, robot = world.plan, world.robot
     if plan.curve is None:
-        change, times, spans, tolerance = (
-            np.diff(plan.positions[:, :3], axis=0),
-            plan.times,
-            np.diff(plan.times),
-            1e-4,
-        )
+        change = np.diff(plan.positions[:, :3], axis=0)
+        times = plan.times
+        spans = np.diff(plan.times)
+        tolerance = 1e-4
         heading = plan.positions[:-1, 2] + change[:, 2] / 2
     else:
         inside = plan.curve.sample_times(24)
@@ -271,10 +265,8 @@ def _check_push(world: World, stage: Stage, hold: Hold) -> Iterator[Violation]:
     if not grasp.pushed:
         return
     size, link = len(stage.times), stage.links[hold.object, grasp.link]
-    rotations, origins = (
-        np.broadcast_to(link.rotation, (size, 3, 3)),
-        np.broadcast_to(link.translation, (size, 3)),
-    )
+    rotations = np.broadcast_to(link.rotation, (size, 3, 3))
+    origins = np.broadcast_to(link.translation, (size, 3))
     contacts = (
         stage.tool @ world.compute_front(grasp.opening) @ make_pose((0.0, 0.0, grasp.standoff))
     ).translation  # in the world

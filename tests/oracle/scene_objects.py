@@ -390,11 +390,9 @@ def load_robot(
         raise NotJudged("an SRDF with defaults of links")
     base, joints = settings.get("base") or {}, settings.get("joints") or {}
     height = float(base.get("height", 0.0)) if height is None else height
-    velocities, accelerations = (
-        base.get("velocity", (1.0, 1.0, 2.0)),
-        base.get("acceleration", (3.0, 3.0, 6.0)),
-    )
-    (x, y) = base.get("position", ((-20.0, 20.0), (-20.0, 20.0)))
+    velocities = base.get("velocity", (1.0, 1.0, 2.0))
+    accelerations = base.get("acceleration", (3.0, 3.0, 6.0))
+    x, y = base.get("position", ((-20.0, 20.0), (-20.0, 20.0)))
     intervals = (x, y, (-np.inf, np.inf))
     limits = {
         f"base_{k}": (*interval, v, a)

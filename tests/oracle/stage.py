@@ -112,10 +112,8 @@ class World:
             self.held.append(
                 Hold(name, description["attachment"], description.get("by"), bool(measured))
             )
-            grasp, values = (
-                self.objects[name].grasps[description["attachment"]],
-                description.get("at"),
-            )
+            grasp = self.objects[name].grasps[description["attachment"]]
+            values = description.get("at")
             freedoms = {
                 name: values[k] if values else 0.0 for k, (name, *_) in enumerate(grasp.freedoms)
             }
@@ -250,15 +248,11 @@ class World:
         From one sample to the next no coordinate changes by more than `length` [m] or `angle`
         [rad].
         """
-        plan, phase, fingers = (
-            self.plan,
-            self.plan.phases[number],
-            self.compute_finger_joints(number),
-        )
-        positions, times = (
-            plan.positions[phase.first : phase.last + 1],
-            plan.times[phase.first : phase.last + 1],
-        )
+        plan = self.plan
+        phase = self.plan.phases[number]
+        fingers = self.compute_finger_joints(number)
+        positions = plan.positions[phase.first : phase.last + 1]
+        times = plan.times[phase.first : phase.last + 1]
         if plan.curve is None:
             steps = np.abs(np.diff(positions, axis=0))
         else:  # the fastest part of a step determines its samples
@@ -271,10 +265,8 @@ class World:
             steps = _PARTS * np.abs(np.diff(parts, axis=1)).max(axis=1)
         units = np.array([length if self.is_length(name) else angle for name in plan.names])
         for joint, (by, factor, _) in self.robot.coupled.items():
-            k, unit = (
-                3 + self.robot.arm.index(by),
-                length if self.robot.tree.urdf.get_joint_type(joint) == "prismatic" else angle,
-            )
+            k = 3 + self.robot.arm.index(by)
+            unit = length if self.robot.tree.urdf.get_joint_type(joint) == "prismatic" else angle
             units[k] = min(units[k], unit / abs(factor))
         ratio = np.maximum(
             (steps / units).max(axis=1), np.linalg.norm(steps[:, :2], axis=1) / length

@@ -22,10 +22,8 @@ _REQUEST, _RESULT = coal.DistanceRequest(), coal.DistanceResult()
 def compute_distance(one: object, here: Poses, other: object, there: Poses, k: int = 0) -> float:
     """Return the signed distance between two shapes at sample k [m]."""
     i, j = (0 if len(place.rotation) == 1 else k for place in (here, there))
-    a, b = (
-        coal.Transform3s(here.rotation[i], here.translation[i]),
-        coal.Transform3s(there.rotation[j], there.translation[j]),
-    )
+    a = coal.Transform3s(here.rotation[i], here.translation[i])
+    b = coal.Transform3s(there.rotation[j], there.translation[j])
     _RESULT.clear()
     return float(coal.distance(one, a, other, b, _REQUEST, _RESULT))
 

@@ -57,10 +57,8 @@ class Shape:
             radius = solid.halfLength + solid.radius
             half = np.array([solid.radius, solid.radius, radius])
         else:
-            half, radius = (
-                np.array([solid.radius, solid.radius, solid.halfLength]),
-                float(np.hypot(solid.radius, solid.halfLength)),
-            )
+            half = np.array([solid.radius, solid.radius, solid.halfLength])
+            radius = float(np.hypot(solid.radius, solid.halfLength))
         return cls(link, solid, placement, np.zeros(3), half, radius)
 
 

@@ -17,10 +17,8 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.experiments.initialization import TARGET
 
 TABLE = (-3.0, 1.3, 1.051)  # on the bar table
-OPEN, SHUT = (
-    vkc.Actuate("refrigerator", {"hinge": 1.57}),
-    vkc.Actuate("refrigerator", {"hinge": 0.0}),
-)
+OPEN = vkc.Actuate("refrigerator", {"hinge": 1.57})
+SHUT = vkc.Actuate("refrigerator", {"hinge": 0.0})
 CUP = (vkc.Grasp("cold_cup"), vkc.Place("cold_cup", TABLE))
 
 

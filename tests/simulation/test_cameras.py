@@ -90,10 +90,8 @@ def test_images_change_only_with_time(images: Images) -> None:
 def test_depth_of_floor_pixels_is_consistent(images: Images) -> None:
     """Floor pixels, projected back along their rays, lie at height 0 and all others above."""
     executed = simulate_drawer()
-    robot, world = (
-        executed.scene.robot,
-        Replay(executed.scene, executed.trajectory.times, executed.rows),
-    )
+    robot = executed.scene.robot
+    world = Replay(executed.scene, executed.trajectory.times, executed.rows)
     row = world.compute_positions(executed.trajectory, executed.planned.times[-1:])[0]
     data = world.model.createData()
     pin.framesForwardKinematics(world.model, data, world.coordinates.q(row))

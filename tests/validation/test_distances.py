@@ -39,9 +39,9 @@ def place_shapes(q: np.ndarray) -> list[pin.SE3]:
 def test_distances_and_nearest_pair_agree_with_coal() -> None:
     shapes, count = make_shapes().world.shapes, make_shapes().body_count
     q = np.array([sample_configuration(seed) for seed in range(3)])
-    placed, pairs = (
-        make_shapes().place(q),
-        np.array([(a, b) for a, b in itertools.combinations(range(len(shapes)), 2) if a < count]),
+    placed = make_shapes().place(q)
+    pairs = np.array(
+        [(a, b) for a, b in itertools.combinations(range(len(shapes)), 2) if a < count]
     )
     pairs = pairs[np.random.default_rng(0).permutation(len(pairs))[:400]]
     nearest, least = placed.find_nearest(pairs)

@@ -95,10 +95,8 @@ def plan_by_trajopt(
             found.about.setdefault("said", []).append(answer["status"])
             path = np.array(answer["z"])
             path[0] = problem.start
-            found.path, found.status = (
-                path,
-                "found" if answer["status"] == "NLP_CONVERGED" else "not converged",
-            )
+            found.path = path
+            found.status = "found" if answer["status"] == "NLP_CONVERGED" else "not converged"
             if accept(path):
                 found.first = clock.cpu_time
                 break

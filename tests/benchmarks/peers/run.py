@@ -98,10 +98,8 @@ def run(
         time_limit: Wall-time limit of a trial [s].
     """
     runner.check_positive(trials=trials)
-    names, chosen = (
-        runner.select_names("task", tasks, TASKS),
-        runner.select_names("method", methods, METHODS),
-    )
+    names = runner.select_names("task", tasks, TASKS)
+    chosen = runner.select_names("method", methods, METHODS)
     settings = {
         "benchmark": "peers",
         "seed": seed,

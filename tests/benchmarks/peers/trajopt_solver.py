@@ -29,19 +29,15 @@ class Solver:
             trajopt_sqp,
         )
 
-        self.ti, self.sqp, self.common, self.collision = (
-            trajopt_ifopt,
-            trajopt_sqp,
-            tesseract_common,
-            tesseract_collision,
-        )
+        self.ti = trajopt_ifopt
+        self.sqp = trajopt_sqp
+        self.common = tesseract_common
+        self.collision = tesseract_collision
         self.environment_module = tesseract_environment
         self.files: tuple[str, str] = ("", "")
         self.environment: Any = None
 
-    def __call__(  # noqa: PLR0915 - sets up one problem, step by step
-        self, ask: dict[str, Any]
-    ) -> dict[str, Any]:
+    def __call__(self, ask: dict[str, Any]) -> dict[str, Any]:
         """Return waypoints, status and time for one initial guess."""
         import numpy as np
 
@@ -71,10 +67,8 @@ class Solver:
             nlp.addConstraintSet(one)
 
         constrain(ti.JointPosConstraint(seed[0], at[0], np.full(len(names), 5.0), "start"))
-        same, target = (
-            self.common.Isometry3d.Identity(),
-            self.common.Isometry3d(np.asfortranarray(ask["target"])),
-        )
+        same = self.common.Isometry3d.Identity()
+        target = self.common.Isometry3d(np.asfortranarray(ask["target"]))
         for k in ask["at"]:
             constrain(
                 ti.CartPosConstraint(at[k], group, ask["frame"], "world", same, target, f"pose_{k}")

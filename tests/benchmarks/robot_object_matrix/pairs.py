@@ -262,10 +262,8 @@ def _why_not(proposals: Proposals) -> str:
 def _on_a_counter(own: Fixture) -> Fixture:
     """Return a low object on a counter that is deep enough for it."""
     setback = round(float(-own.low[0]) + _MARGIN, 3)
-    depth, width = (
-        max(_DEPTH, setback + float(own.high[0]) + _MARGIN),
-        float(own.high[1] - own.low[1]) + 2.0 * _BESIDE,
-    )
+    depth = max(_DEPTH, setback + float(own.high[0]) + _MARGIN)
+    width = float(own.high[1] - own.low[1]) + 2.0 * _BESIDE
     counter = Counter((round(depth, 2), round(width, 2), _COUNTER), setback)
     return replace(own, counter=counter, lift=own.lift + _AIR)
 
@@ -408,10 +406,8 @@ def _face(imported: ImportedObject) -> None:
     front = "front"
     while root.find(f"link[@name='{front}']") is not None:
         front += "_"
-    link, joint = (
-        ElementTree.Element("link", name=front),
-        ElementTree.Element("joint", name=front, type="fixed"),
-    )
+    link = ElementTree.Element("link", name=front)
+    joint = ElementTree.Element("joint", name=front, type="fixed")
     ElementTree.SubElement(joint, "parent", link=front)
     ElementTree.SubElement(joint, "child", link=item.base_link)
     ElementTree.SubElement(joint, "origin", xyz="0 0 0", rpy=f"0 0 {quarters * np.pi / 2.0:.12g}")

@@ -107,16 +107,12 @@ def sample_reachable_poses(robot: Robot, name: str, number: int, *, seed: int = 
         VkcError: Hardly any configuration is free.
     """
     rng = np.random.default_rng([11, seed, zlib.crc32(name.encode())])
-    low, high = (
-        np.where(np.isfinite(robot.lower), robot.lower, -np.pi),
-        np.where(np.isfinite(robot.upper), robot.upper, np.pi),
-    )
+    low = np.where(np.isfinite(robot.lower), robot.lower, -np.pi)
+    high = np.where(np.isfinite(robot.upper), robot.upper, np.pi)
     low[:3], high[:3] = (-_AWAY, -_AWAY, -np.pi), (_AWAY, _AWAY, np.pi)
-    clearances, data, frame = (
-        Clearances(robot),
-        robot.model.createData(),
-        robot.model.getFrameId(robot.tool_frame),
-    )
+    clearances = Clearances(robot)
+    data = robot.model.createData()
+    frame = robot.model.getFrameId(robot.tool_frame)
     poses = list[pin.SE3]()
     for _ in range(number * _TRIES):
         if len(poses) == number:

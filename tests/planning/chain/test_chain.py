@@ -208,11 +208,9 @@ def test_attachment_named_like_a_joint_is_rejected() -> None:
 # --- carried objects
 
 STICK, END = Hold("stick", "grip"), Hold("stick", "end")
-BALL, PULLED, PUSHED = (
-    Hold("ball", "grip"),
-    Hold("ball", "pull", STICK, "tip"),
-    Hold("ball", "pull", END, "tip"),
-)
+BALL = Hold("ball", "grip")
+PULLED = Hold("ball", "pull", STICK, "tip")
+PUSHED = Hold("ball", "pull", END, "tip")
 CARRIED = [
     (END,),
     (STICK, PULLED),

@@ -317,10 +317,8 @@ def test_hand_has_the_clearance_of_its_attachment_from_before_grasp_to_after_rel
     problem = make_program(
         replace_objects(scene, {"door": replace_attachment(placed, handle)}), steps, options=SHORT
     )
-    hand, (_, grasp, turned, release, _) = (
-        set(scene.robot.touch_links),
-        problem.contacts.first_waypoint.tolist(),
-    )
+    hand = set(scene.robot.touch_links)
+    _, grasp, turned, release, _ = problem.contacts.first_waypoint.tolist()
     for phase, waypoint, is_near in (
         (0, grasp - NEAR - 1, False),
         (0, grasp - NEAR, True),

@@ -151,10 +151,8 @@ def test_guesses_at_the_goal_are_not_changed(chain: VirtualKinematicChain) -> No
 
 def test_equal_limits_fix_coordinates(robot: VirtualKinematicChain) -> None:
     goal, rng = make_home(robot, 0.5, -0.3, 0.4), np.random.default_rng(4)
-    target, guesses = (
-        compute_placement(robot, goal),
-        goal + rng.uniform(-0.3, 0.3, (40, robot.size)),
-    )
+    target = compute_placement(robot, goal)
+    guesses = goal + rng.uniform(-0.3, 0.3, (40, robot.size))
     lower, upper = get_limits(robot)
     lower[5] = upper[5] = goal[5]
     _, found = solve(robot, guesses, target, lower=lower, upper=upper)

@@ -29,10 +29,8 @@ def test_profile_keeps_the_limits_in_the_time(seed: int, size: float) -> None:
     profile = fine**2 * (3.0 - 2.0 * fine)
     for first, last in runs:
         assert np.ptp(times[first:last]) == 0.0
-        distance, duration = (
-            np.abs(np.diff(path[first : last + 1], axis=0)).sum(axis=0),
-            times[first:last].sum(),
-        )
+        distance = np.abs(np.diff(path[first : last + 1], axis=0)).sum(axis=0)
+        duration = times[first:last].sum()
         step = duration / 400
         speed, strength = (
             np.abs(np.diff(profile, order)).max() / step**order * distance for order in (1, 2)

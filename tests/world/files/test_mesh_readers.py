@@ -62,10 +62,8 @@ def make_random_prism(rng: np.random.Generator) -> tuple[np.ndarray, list[list[i
     """Return vertices and polygons of a prism over a polygon, in a random place."""
     count = int(rng.integers(3, 8))
     outline = make_random_outline(rng, count)
-    low, high = (
-        np.column_stack([outline, np.zeros(count)]),
-        np.column_stack([outline, np.ones(count)]),
-    )
+    low = np.column_stack([outline, np.zeros(count)])
+    high = np.column_stack([outline, np.ones(count)])
     turn = trimesh.transformations.random_rotation_matrix(rng.random(3))[:3, :3]
     vertices = np.vstack([low, high]) @ turn.T + rng.uniform(-2.0, 2.0, 3)
     sides = [[k, (k + 1) % count, count + (k + 1) % count, count + k] for k in range(count)]

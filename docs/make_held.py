@@ -11,7 +11,7 @@ import pinocchio as pin
 
 import vkc_pin as vkc
 from vkc_pin.experiments import chores
-from vkc_pin.planning.initialization import interpolation, rrt
+from vkc_pin.planning.initialization import closed_trees, interpolation
 from vkc_pin.planning.initialization.keyframes import compute_shortfall
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, use_style
@@ -36,7 +36,7 @@ def main() -> int:
     ) -> np.ndarray | None:
         path, sampler = search(paths, phase, through, straight), paths.sampler
         if path is not None:
-            own = rrt._ClosedSearch(sampler, phase, through, len(straight))
+            own = closed_trees._ClosedSearch(sampler, phase, through, len(straight))
             closed, _ = own.project(straight, np.arange(own.begin + 1.0, own.end + 1.0))
             seen.append((sampler.problem, [closed, path]))
         return path

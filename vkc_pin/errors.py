@@ -8,15 +8,6 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-__all__ = [
-    "BuildError",
-    "InputError",
-    "UnknownNameError",
-    "VkcError",
-    "find_nearest_name",
-    "format_value",
-]
-
 _MAX_VALUE_LENGTH = 300  # characters of a value in a message
 _MAX_NAME_LENGTH = 80
 

@@ -8,8 +8,6 @@ from typing import Any, Literal, Self, get_args
 from vkc_pin.errors import InputError, format_value
 from vkc_pin.utils.arguments import check_integer, check_number
 
-__all__ = ["Options"]
-
 Objective = Literal["path_length", "control_effort"]
 OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
 _MIN, _MAX = 1e-9, 1e9

@@ -14,8 +14,7 @@ from helpers.markdown import parse_cells
 import vkc_pin as vkc
 from vkc_pin import Report
 from vkc_pin.experiments import door_and_drawer
-from vkc_pin.experiments.comparison import choose_shown_trial, format_results
-from vkc_pin.experiments.door_and_drawer import COMPARED_PLANNERS
+from vkc_pin.experiments.comparison import COMPARED_PLANNERS, choose_shown_trial, format_results
 from vkc_pin.planning.plan import PlanningStatistics
 
 SUCCESSES = {"B1": {2, 3}, "B2": {1, 2}, "VKC": {0, 1, 2}}

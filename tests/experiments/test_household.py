@@ -13,9 +13,8 @@ from helpers.experiments import run_experiment
 from helpers.small_problems import make_program
 
 import vkc_pin as vkc
-from vkc_pin.experiments.comparison import place_objects
+from vkc_pin.experiments.comparison import COMPARED_PLANNERS, place_objects
 from vkc_pin.experiments.household import (
-    COMPARED_PLANNERS,
     COMPARISON,
     PAPER,
     TABLE_TOP,

@@ -18,25 +18,21 @@ from vkc_pin.cli.importing import add_importing
 from vkc_pin.cli.options import (
     EXIT_FAILED,
     EXIT_INFEASIBLE,
-    EXIT_INTERRUPTED,
     EXIT_MISUSE,
-    EXIT_OK,
     CommandParser,
     GroupedCommands,
     GroupedHelp,
     add_command,
     add_option,
     add_seed,
-    parse_positive,
 )
 from vkc_pin.cli.steps import add_steps, make_steps
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.experiments.commands import add_bench
+from vkc_pin.utils.command_line import EXIT_INTERRUPTED, EXIT_OK, parse_positive
 from vkc_pin.world.files.writing import check_outputs, write_atomically
 from vkc_pin.world.trajectory.formats.rosbag import import_rosbags
 from vkc_pin.world.trajectory.formats.tables import GROUPS
-
-__all__ = ["EXIT_MISUSE", "make_parser", "run"]
 
 # Exit codes by the status of a plan; others mean failure
 _STATUS_CODES = {"infeasible": EXIT_INFEASIBLE, "interrupted": EXIT_INTERRUPTED}

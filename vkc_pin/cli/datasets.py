@@ -8,17 +8,13 @@ from typing import Any
 
 from vkc_pin.cli.options import (
     EXIT_FAILED,
-    EXIT_OK,
     add_command,
     add_option,
     add_seed,
-    parse_positive,
 )
 from vkc_pin.errors import InputError, VkcError
-from vkc_pin.utils.command_line import report_interruption
+from vkc_pin.utils.command_line import EXIT_OK, parse_positive, report_interruption
 from vkc_pin.utils.interrupt import raise_on_interrupt
-
-__all__ = ["add_datasets"]
 
 
 def add_datasets(commands: Any) -> None:

@@ -11,14 +11,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from vkc_pin.cli.options import EXIT_FAILED, EXIT_OK, add_command, add_option
+from vkc_pin.cli.options import EXIT_FAILED, add_command, add_option
 from vkc_pin.errors import InputError
+from vkc_pin.utils.command_line import EXIT_OK
 from vkc_pin.utils.optional_imports import import_optional
 from vkc_pin.utils.system import has_screen
 from vkc_pin.world.files.resources import find_resource_folder
 from vkc_pin.world.files.writing import check_outputs, write_atomically
-
-__all__ = ["add_completion", "add_first_steps"]
 
 _PAGE = "vkc-pin-demo.html"
 _SHELLS = ("bash", "fish", "zsh")

@@ -14,18 +14,15 @@ from typing import TYPE_CHECKING, Any
 
 from vkc_pin.cli.options import (
     EXIT_FAILED,
-    EXIT_OK,
     add_command,
     add_option,
     add_seed,
-    parse_positive,
 )
 from vkc_pin.errors import InputError
+from vkc_pin.utils.command_line import EXIT_OK, parse_positive
 
 if TYPE_CHECKING:
     from vkc_pin.importing.objects.object_import import ImportedObject
-
-__all__ = ["add_importing"]
 
 
 def add_importing(commands: Any) -> None:

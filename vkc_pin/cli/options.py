@@ -6,23 +6,7 @@ import argparse
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from vkc_pin.utils.command_line import EXIT_INTERRUPTED, EXIT_OK, parse_natural, parse_positive
-
-__all__ = [
-    "EXIT_FAILED",
-    "EXIT_INFEASIBLE",
-    "EXIT_INTERRUPTED",
-    "EXIT_MISUSE",
-    "EXIT_OK",
-    "CommandParser",
-    "GroupedCommands",
-    "GroupedHelp",
-    "add_command",
-    "add_option",
-    "add_seed",
-    "parse_natural",
-    "parse_positive",
-]
+from vkc_pin.utils.command_line import parse_natural
 
 EXIT_FAILED, EXIT_MISUSE, EXIT_INFEASIBLE = 1, 2, 3
 

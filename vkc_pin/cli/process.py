@@ -17,8 +17,6 @@ from typing import Any, NoReturn, TextIO
 from vkc_pin.errors import BuildError
 from vkc_pin.utils.optional_imports import explain_unfit_libraries
 
-__all__ = ["main"]
-
 _MISUSE, _INTERRUPTED = 2, 130
 
 

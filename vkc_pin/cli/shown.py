@@ -20,7 +20,6 @@ from vkc_pin.world.scene.scene import Scene, load_scene
 if TYPE_CHECKING:
     from vkc_pin.planning.plan import Plan
 
-__all__ = ["find_description", "load_shown"]
 
 _ROBOT = "husky_ur5e"  # stands beside an object, for scale
 _BESIDE = 1.5  # [m] between the centre of its base and the object

@@ -13,7 +13,6 @@ from vkc_pin.errors import InputError
 if TYPE_CHECKING:
     from vkc_pin.world.task.steps import Step
 
-__all__ = ["add_steps", "make_steps", "parse_settings"]
 
 _SETTING = "OBJECT.JOINT=VALUE, e.g. door.hinge=1.2"
 _JOINT = "NAME=VALUE, e.g. elbow_joint=1.2"

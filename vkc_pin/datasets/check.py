@@ -33,8 +33,6 @@ from vkc_pin.utils.parallel import CrashedTask, is_dask_installed, run_tasks
 from vkc_pin.validation.validate import validate
 from vkc_pin.world.files.writing import check_inside, check_writable, write_atomically
 
-__all__ = ["DatasetCheck", "check_dataset"]
-
 _LISTED = 20  # problems in the text
 _PICTURES = 10  # episodes on the statistics page
 _RENDERED = 3  # episodes of which the first, middle and last images are rendered again

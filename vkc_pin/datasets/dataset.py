@@ -23,19 +23,6 @@ from vkc_pin.world.files.fields import make_validation_error
 from vkc_pin.world.files.resources import check_path
 from vkc_pin.world.files.writing import check_name, write_atomically
 
-__all__ = [
-    "EPISODES_A_SHARD",
-    "FOLDERS",
-    "MEMBERS",
-    "Dataset",
-    "Register",
-    "check_attempt",
-    "has_intact_scene",
-    "read_intact_numbers",
-    "read_table",
-    "write_table",
-]
-
 EPISODES_A_SHARD = 100
 """Episodes in one shard; the last one of each robot may have fewer."""
 FOLDERS = ("lerobot", "robots", "scenes", "shards", "work")

@@ -11,14 +11,6 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = [
-    "NEAR",
-    "DuplicateFinder",
-    "compute_coverage",
-    "compute_winding_numbers",
-    "sample_coarse_trajectory",
-]
-
 NEAR = 0.02
 """Largest difference of near-duplicates in any coordinate [m] or [rad].
 

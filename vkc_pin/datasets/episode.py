@@ -36,19 +36,6 @@ from vkc_pin.world.task.steps import Step, step_from_dict, step_to_dict
 from vkc_pin.world.task.terms import Term, term_from_dict, term_to_dict
 from vkc_pin.world.trajectory.trajectory import MOST_SAMPLES, Trajectory
 
-__all__ = [
-    "Episode",
-    "Made",
-    "compute_scene_name",
-    "get_work_file",
-    "make_episode",
-    "pack",
-    "run_attempt",
-    "run_attempts",
-    "sample_times",
-    "unpack",
-]
-
 _PLANNER = {"entries": 512, "megabytes": 96.0}
 _DIGITS = 12  # digits of a scene's name
 # [m], [rad], [m/s], ...: trajectories are rounded to 0.5e-9; smaller digits are noise, which does

@@ -24,10 +24,10 @@ from vkc_pin.datasets.dataset import (
     read_intact_numbers,
 )
 from vkc_pin.datasets.episode import Made, get_work_file
-from vkc_pin.datasets.formats import hdf5
 from vkc_pin.datasets.formats import lerobot as lerobot_layout
 from vkc_pin.datasets.formats.card import make_card
 from vkc_pin.datasets.formats.hdf5 import make_parts
+from vkc_pin.datasets.formats.hdf5_reader import require_h5py
 from vkc_pin.datasets.recipe import CAMERAS, Recipe, load_recipe, make_entries
 from vkc_pin.datasets.robots import check_frames, prepare_robots
 from vkc_pin.errors import InputError, VkcError
@@ -46,8 +46,6 @@ from vkc_pin.world.files.writing import (
     write_atomically,
 )
 from vkc_pin.world.task.terms import Term
-
-__all__ = ["generate"]
 
 _MAX_ATTEMPTS_PER_EPISODE = 4  # attempts per requested episode, after which generation fails
 _MAX_AHEAD = 10  # attempts that are started, as a multiple of those after which generation fails
@@ -156,7 +154,7 @@ def _load_recipe(
         loaded = load_recipe(loaded, cameras=CAMERAS)
     if entries := make_entries(terms):
         loaded = load_recipe(loaded, terms=[*loaded.document["terms"], *entries])
-    hdf5.require_h5py()
+    require_h5py()
     if loaded.fields.simulate:
         import_mujoco()
     check_frames(loaded)

@@ -29,15 +29,6 @@ from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Actuate, Grasp, Place, Step
 from vkc_pin.world.task.terms import Term, trace_terms
 
-__all__ = [
-    "NoProblemError",
-    "Problem",
-    "describe_problem",
-    "find_grasping_start",
-    "resolve_episode_terms",
-    "sample_problem",
-]
-
 _BATCH = 48  # random configurations that inverse kinematics brings to the grasp at once
 _DRAWS = 6  # batches before there is none
 _EXACT = 1e-2 * TOLERANCE  # [m], [rad]: accepted distance of the hand from its grasp

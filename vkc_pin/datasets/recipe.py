@@ -47,31 +47,6 @@ from vkc_pin.world.task.terms import (
     trace_terms_without_scene,
 )
 
-__all__ = [
-    "CAMERAS",
-    "OBJECT",
-    "TASKS",
-    "CameraSchema",
-    "GoalSchema",
-    "KeepOutSchema",
-    "Recipe",
-    "RecipeSchema",
-    "RobotEntry",
-    "RoomsSchema",
-    "SpeedSchema",
-    "StartSchema",
-    "TermSchema",
-    "TracedSchema",
-    "UprightSchema",
-    "check_entries",
-    "check_robot",
-    "get_robot_name",
-    "is_path",
-    "load_recipe",
-    "make_entries",
-    "resolve_terms",
-]
-
 OBJECT = "object"
 """Frame of the grasped link, and the grasped object in `holding`."""
 

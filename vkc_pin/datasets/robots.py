@@ -23,8 +23,6 @@ from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import find_robot, find_robot_files, load_robot
 from vkc_pin.world.scene.scene import load_scene
 
-__all__ = ["check_frames", "prepare_robots"]
-
 # configurations for pairs that need no check, as of robots that are loaded without an SRDF
 _SAMPLES = 1000
 

@@ -21,7 +21,6 @@ from vkc_pin.world.trajectory.world_model import World
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["make_statistics_page"]
 
 _STYLE = (
     "body{font:15px/1.5 sans-serif;margin:2em auto;max-width:70em;padding:0 1em;color:#222}"

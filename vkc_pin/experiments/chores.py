@@ -34,17 +34,6 @@ from vkc_pin.procedural.rooms.clutter import add_clutter
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate, Grasp, Place, Step
 
-__all__ = [
-    "CHORES",
-    "Chore",
-    "fetch",
-    "format_results",
-    "home",
-    "make_cluttered_home",
-    "plan_trial",
-    "run",
-]
-
 WINDOW = 2
 ONE_CALL, STEP_BY_STEP = "VKC", "step by step"
 THINGS = 300  # in the cluttered home

@@ -18,8 +18,6 @@ from vkc_pin.utils.command_line import (
 )
 from vkc_pin.utils.interrupt import raise_on_interrupt
 
-__all__ = ["add_bench", "add_choice", "add_count", "add_experiment"]
-
 
 def add_bench(commands: Any) -> None:
     """Add the command "bench" to the subparsers of a parser."""

@@ -48,19 +48,6 @@ from vkc_pin.world.scene.poses import as_placement
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate, GoTo, Place, Step
 
-__all__ = [
-    "BUDGETS",
-    "COLD",
-    "COMPARED_PLANNERS",
-    "CRITERIA",
-    "METHODS",
-    "WAYPOINTS",
-    "Assignment",
-    "Comparison",
-    "format_results",
-    "select_compared_methods",
-]
-
 WAYPOINTS = {f"{method}x{finer}": (method, finer) for finer in (1, 3) for method in BASELINES}
 """Baselines with other numbers of waypoints: name → method, multiple of VKC's number."""
 

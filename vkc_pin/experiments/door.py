@@ -15,16 +15,14 @@ from tqdm import tqdm
 from vkc_pin.experiments.harness.record import (
     describe_environment,
     distribution,
-    measure_peak_memory,
     trial,
 )
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import plan
+from vkc_pin.utils.system import measure_peak_memory
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate, Grasp, Reach
-
-__all__ = ["TASKS", "run", "table"]
 
 TASKS = ("reach", "whole", "push", "push blind")
 GOAL = {"hinge": 1.2}

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from vkc_pin.experiments.comparison import (
-    COMPARED_PLANNERS,
     Assignment,
     Comparison,
     select_compared_methods,
@@ -14,8 +13,6 @@ from vkc_pin.experiments.comparison import (
 from vkc_pin.experiments.harness.charts import criteria_chart
 from vkc_pin.experiments.harness.record import Record
 from vkc_pin.world.task.steps import Actuate
-
-__all__ = ["COMPARED_PLANNERS", "TASKS", "format_results", "plan_trial", "run"]
 
 TASKS = {
     "door": Assignment("corridor_door", (Actuate("door", {"hinge": 1.5}),), "push a door open"),

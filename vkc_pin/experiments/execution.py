@@ -40,8 +40,6 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Actuate, Grasp, Place, Reach
 
-__all__ = ["DEGREES_PER_MM", "TASKS", "displace_hand", "format_results", "grasp_in_physics", "run"]
-
 DEGREES_PER_MM = 0.4
 """Rotation of a displaced hand per displacement [°/mm]."""
 _DRAWS = 20  # directions that are tried

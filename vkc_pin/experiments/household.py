@@ -9,25 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from vkc_pin.experiments.comparison import COMPARED_PLANNERS, Assignment, Comparison
+from vkc_pin.experiments.comparison import Assignment, Comparison
 from vkc_pin.experiments.harness import runner
 from vkc_pin.experiments.harness.charts import means_chart, success_chart
 from vkc_pin.experiments.harness.record import Record
 from vkc_pin.world.files.documents import read_yaml
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate, GoTo, Place
-
-__all__ = [
-    "COMPARED_PLANNERS",
-    "PAPER",
-    "TABLE_TOP",
-    "TASKS",
-    "format_results",
-    "make_paper_home",
-    "plan_trial",
-    "run",
-    "sample_cup_pose",
-]
 
 TABLE_TOP = ((2.5, 3.0), (-1.9, -0.9))
 """The coffee table's plate in the scene `household`: x and y, lowest and highest [m]."""

@@ -29,17 +29,6 @@ from vkc_pin.planning.planner import plan
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Grasp, Touch
 
-__all__ = [
-    "COMPARED_INITIALIZATIONS",
-    "SCENES",
-    "STEPWISE",
-    "TARGET",
-    "format_results",
-    "plan_trial",
-    "run",
-    "specify",
-]
-
 SCENES = ("init_1", "init_2", "init_3")
 COMPARED_INITIALIZATIONS = ("stationary", "interpolated", "astar", "rrt", "auto")
 STEPWISE = "step after step"

@@ -11,8 +11,6 @@ from vkc_pin.experiments.comparison import Assignment, place_objects
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate, Grasp, Touch
 
-__all__ = ["TASKS", "make_start"]
-
 TASKS: Mapping[str, Assignment] = {
     "door": Assignment("door", (Actuate("door", door.GOAL),), "open a door"),
     "drawer": Assignment("drawer", (Actuate("drawer", {"slide": 0.3}),), "pull a drawer"),

@@ -37,16 +37,6 @@ from vkc_pin.world.files.resources import check_path
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = [
-    "ERROR",
-    "PIECES",
-    "Pieces",
-    "compute_concavity",
-    "compute_solid_volume",
-    "decompose",
-    "is_flat",
-    "measure_outside",
-]
 
 ERROR = 0.02
 """Largest protrusion of pieces over the surface [m], about the clearance margin of motions."""

@@ -10,8 +10,6 @@ from vkc_pin.errors import InputError
 from vkc_pin.world.files.documents import read_head, read_text
 from vkc_pin.world.files.xml import parse_xml
 
-__all__ = ["check_no_arguments", "read_root"]
-
 _HEAD = 4096  # bytes in which the first element of an XML file begins
 _SIGNATURES = {
     b"#usda": "USD",

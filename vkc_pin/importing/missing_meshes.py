@@ -11,8 +11,6 @@ from pathlib import Path, PurePosixPath
 from vkc_pin.errors import InputError
 from vkc_pin.world.files.urdf import UrdfFile
 
-__all__ = ["MissingMesh", "make_missing_error", "replace_found_meshes", "replace_missing_meshes"]
-
 _EXTENSIONS = (".stl", ".obj", ".dae", ".ply", ".STL", ".OBJ", ".DAE", ".PLY")
 
 

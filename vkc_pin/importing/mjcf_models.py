@@ -14,8 +14,6 @@ from vkc_pin.utils.system import is_file
 from vkc_pin.world.files.documents import read_text
 from vkc_pin.world.files.xml import parse_xml
 
-__all__ = ["NO_MASS", "compile_mjcf"]
-
 NO_MASS = 1e-14
 """Mass [kg] that a compiled body has if its file states none, just above MuJoCo's minimum."""
 _REDUCED = (

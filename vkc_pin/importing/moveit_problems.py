@@ -22,8 +22,6 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.files.documents import parse_document, read_yaml
 from vkc_pin.world.scene.scene import Scene
 
-__all__ = ["Problem", "list_problems", "read_problem"]
-
 _FIELDS = {"box": 3, "cylinder": 2, "sphere": 1}
 """Type of a primitive → number of its dimensions [m]."""
 _ARENA = 10.0  # [m] half the edge of the square that a driving base may use

@@ -20,8 +20,6 @@ from vkc_pin.utils.optional_imports import import_optional
 from vkc_pin.utils.system import is_file
 from vkc_pin.world.files.resources import find_package
 
-__all__ = ["expand_xacro", "uses_xacro"]
-
 _FIND = re.compile(r"\$\(find\s+([^\s()$]+)\s*\)")  # NAME in $(find NAME)
 _COMMENT = re.compile(r"<!--.*?-->", re.DOTALL)
 # NAME in <xacro:arg name="NAME" ...>, $(arg NAME) and xacro.arg('NAME')

@@ -23,7 +23,6 @@ from vkc_pin.world.models.shapes import get_link_name, triangulate
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Triangles", "plot_attachments", "plot_robot", "to_rgb"]
 
 _PANELS = 12  # largest number of panels
 _COLUMNS = 4

@@ -7,8 +7,6 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TypeVar
 
-__all__ = ["ImportProgress"]
-
 T = TypeVar("T")
 _LOGGER = logging.getLogger(__name__)
 _PATIENCE = 2.0  # [s] before the first and between all progress lines

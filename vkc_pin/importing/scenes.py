@@ -20,14 +20,6 @@ from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import list_robots
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene
 
-__all__ = [
-    "locate_robot",
-    "make_object_scene",
-    "make_robot_scene",
-    "refer_to_robot",
-    "write_scene",
-]
-
 _ROOM = 3.0  # [m] of floor around the base of a robot
 _DISTANCES = np.arange(1.2, 6.0, 0.2)  # [m] of the start from the object's grasp
 _MARGIN = 2.0  # [m] of floor around start and object

@@ -13,17 +13,6 @@ import pinocchio as pin
 from vkc_pin.errors import InputError
 from vkc_pin.world.files.writing import MANIFEST, check_writable
 
-__all__ = [
-    "add_connection",
-    "add_origin",
-    "check_source",
-    "check_target",
-    "format_comment",
-    "format_numbers",
-    "get_origin_marker",
-    "round_values",
-]
-
 # Characters to read of a first line: file names have up to 255 bytes, or 1530 when escaped.
 _FIRST_LINE_LENGTH = 4096
 

@@ -14,8 +14,6 @@ from vkc_pin.planning.solve_task import TaskResult
 from vkc_pin.utils.budget import STOP_STATUSES, current_ending, share_budget
 from vkc_pin.world.task.steps import Step
 
-__all__ = ["Alternatives", "Search", "try_alternatives"]
-
 Alternatives = Iterable[tuple[str, tuple[Step, ...]]]
 """Names of alternatives, such as "cup.top", and their steps."""
 

@@ -20,8 +20,6 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Reach
 
-__all__ = ["inverse_kinematics"]
-
 _MAX_BATCHES = 8
 """Batches of random configurations that are tried."""
 

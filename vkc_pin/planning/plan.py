@@ -40,7 +40,6 @@ if TYPE_CHECKING:
 
     from vkc_pin.simulation.result import SimulationResult
 
-__all__ = ["STAGES", "Plan", "PlanningStatistics"]
 
 STAGES = ("initialization", "coal", "casadi", "ipopt", "retiming", "validation")
 """Stages of planning whose times are measured."""

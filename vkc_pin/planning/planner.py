@@ -35,8 +35,6 @@ from vkc_pin.world.task.phases import Task, summarize_phases
 from vkc_pin.world.task.steps import Step, as_steps
 from vkc_pin.world.task.terms import Term, check_terms_active
 
-__all__ = ["Planner", "acquire_cache", "plan"]
-
 
 class Planner:
     """Owns the caches of planning: symbolic programs with their solvers, kinematics, shape tables.

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from vkc_pin.planning.plan import Plan
     from vkc_pin.planning.solver.solution import Iteration
 
-__all__ = ["Progress", "show_progress"]
-
 
 class Progress:
     """The progress line; `write` shows a text, and whether it is the last. Default: no line."""

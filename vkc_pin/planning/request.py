@@ -17,8 +17,6 @@ from vkc_pin.utils.cache import Cache
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.terms import Term, trace_terms
 
-__all__ = ["PlanningRequest", "check_arguments", "make_budget", "make_request"]
-
 DEFAULT_TIME_LIMIT = 60.0
 """Wall-clock limit of a planning call that gives no limit [s]."""
 

@@ -23,18 +23,6 @@ from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.splicing import concatenate_trajectories
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = [
-    "CURVELESS",
-    "FINAL",
-    "MAX_REPAIRS",
-    "add_statistics",
-    "complete_draft",
-    "concatenate_plans",
-    "make_stationary_trajectory",
-    "retime_validated",
-    "sum_statistics",
-]
-
 FINAL = (*STOP_STATUSES, "infeasible")
 """Statuses after which no alternative is tried."""
 

@@ -30,8 +30,6 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Grasp, Reach
 
-__all__ = ["ReachableAttachment", "SceneCheck", "check_scene"]
-
 _LITTLE_FLOOR = 1.0  # [m²] for the base's origin; less than 1 m² keeps most bases from turning
 _FAR = 0.25  # largest reported clearance [m]
 

@@ -28,14 +28,6 @@ from vkc_pin.world.task.phases import Task
 from vkc_pin.world.task.steps import Step
 from vkc_pin.world.trajectory.world_model import compute_final_scene
 
-__all__ = [
-    "PlannedStep",
-    "plan_each_step",
-    "plan_sequentially",
-    "plan_simultaneously",
-    "solve_with_alternatives",
-]
-
 
 class PlannedStep(NamedTuple):
     """Result of a step, or of two steps planned as one problem.

@@ -57,8 +57,6 @@ from vkc_pin.world.task.phases import Task
 from vkc_pin.world.trajectory.formats.archives import PlanStatus
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["TaskResult", "solve_task"]
-
 _CHECK_TIME = 2e-3
 """Time per waypoint [s] that validation takes, until it was measured; rather too long."""
 

@@ -26,8 +26,6 @@ from vkc_pin.world.task.steps import Step, describe_step
 from vkc_pin.world.trajectory.splicing import extract_phases
 from vkc_pin.world.trajectory.world_model import compute_final_scene
 
-__all__ = ["plan_with_window"]
-
 _NOTHING = PhaseWaypoints((), (), (), "")
 
 

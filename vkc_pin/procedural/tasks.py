@@ -16,8 +16,6 @@ from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Actuate, Grasp, Step
 
-__all__ = ["goals", "random_task"]
-
 _SHARES = (0.35, 0.65)  # fraction of a joint's range by which random tasks move it
 _TURN = np.pi  # [rad] range of joints without limits
 _MAX_OBJECTS = 2  # in one room

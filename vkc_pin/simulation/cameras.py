@@ -19,17 +19,6 @@ from vkc_pin.simulation.snapshots import RenderedScene
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.robot import Robot
 
-__all__ = [
-    "BASE",
-    "HAND",
-    "ROBOT",
-    "Camera",
-    "Images",
-    "check_frame",
-    "render_images",
-    "resolve_frame",
-]
-
 BASE, HAND = "base", "hand"
 """Frames of every robot: that of the mobile base, and the tool frame, whose z axis points ahead and
 along whose x axis the fingers close."""

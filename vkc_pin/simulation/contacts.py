@@ -17,9 +17,8 @@ import numpy as np
 from vkc_pin.options import Options
 from vkc_pin.utils.arrays import Ints
 from vkc_pin.validation.distances import CollisionShapes
-from vkc_pin.world.scene.clearance_exemptions import find_clearance_exemptions
+from vkc_pin.world.scene.clearance_exemptions import CONTACT_DEPTH, find_clearance_exemptions
 from vkc_pin.world.scene.contact_rules import (
-    CONTACT_DEPTH,
     CONTACT_WINDOW,
     find_grasped_link,
     find_touch_links,
@@ -29,8 +28,6 @@ from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
-
-__all__ = ["Contact", "Pairs", "find_contact_pairs", "find_unplanned_contacts"]
 
 # [m] Links that are planned to be closer may touch: some descriptions put cups a millimetre above
 # tables.

@@ -33,14 +33,12 @@ from vkc_pin.simulation.servos import (
 from vkc_pin.simulation.welds import Grips, Latches, find_hold_spans, find_latches
 from vkc_pin.utils.arguments import check_instance
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.scene.contact_rules import CONTACT_DEPTH
+from vkc_pin.world.scene.clearance_exemptions import CONTACT_DEPTH
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Step, as_steps
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
-
-__all__ = ["GRASPS", "simulate"]
 
 GRASPS = ("weld", "friction")
 """Grasp models."""

@@ -29,18 +29,6 @@ from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
-__all__ = [
-    "Fingers",
-    "Sides",
-    "Span",
-    "Squeezes",
-    "find_fingers",
-    "find_grip_changes",
-    "insert_pauses",
-    "limit_finger_servos",
-    "split_spans",
-]
-
 _MASS = 0.1  # [kg] of a sliding finger
 _REACH = 0.2  # [m] largest distance of a finger's shapes from the tool frame
 _COUPLING = (0.004, 1.0)  # time constant [s] and damping ratio of the coupling of fingers

@@ -36,8 +36,6 @@ from vkc_pin.world.trajectory.free_objects import FreeObjects
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
-__all__ = ["Miss", "compute_placement", "measure_goal_errors"]
-
 _TOLERANCE = 2e-3  # [m] or [rad] within which a plan counts as having completed a step
 _LASTING = (Actuate, Place, Release)  # steps after which objects stay where they are
 

@@ -28,8 +28,6 @@ from vkc_pin.world.scene.contact_rules import is_rigid_grasp
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.trajectory.world_model import World
 
-__all__ = ["Builder", "PhysicalWorld", "to_mujoco_quaternion"]
-
 # [kg], [kg·m²] of the body between hand and link of a grasp with degrees of freedom
 _CARRIER_MASS, _CARRIER_INERTIA = 0.05, 1e-4
 _CARRIER_DAMPING = 0.02  # of these degrees of freedom [N·m·s/rad] or [N·s/m]

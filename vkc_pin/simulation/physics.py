@@ -14,8 +14,6 @@ from vkc_pin.utils.optional_imports import import_optional
 from vkc_pin.world.models.dynamics import compute_solid_inertia
 from vkc_pin.world.trajectory.world_model import World
 
-__all__ = ["Physics", "complete_inertias", "import_mujoco"]
-
 _NO_MASS = 1e-9  # [kg] up to which a body counts as massless
 _LEAST_MASS = 1e-3  # [kg] of bodies with neither mass nor collision shape
 _LEAST_INERTIA = 1e-6  # smallest moment of inertia per mass [m²]: (1 mm)²

@@ -16,8 +16,6 @@ from vkc_pin.world.trajectory.placements import sample_motion
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
-__all__ = ["Execution", "Replay", "write_page"]
-
 _RATE = 20.0  # [Hz] key frames of a page
 
 

@@ -36,8 +36,6 @@ from vkc_pin.world.task.steps import Step, step_to_dict
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World, make_scene_at
 
-__all__ = ["SimulationResult", "Tracking"]
-
 GOAL = {"m": 0.01, "rad": 0.02}
 """Tolerances within which a goal counts as reached."""
 DEPTH = 1e-3

@@ -17,15 +17,6 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.wheels import rotate_into_base_frame
 from vkc_pin.world.trajectory.world_model import World
 
-__all__ = [
-    "Servo",
-    "compute_feedforward",
-    "make_servo",
-    "make_servos",
-    "sample_fingers",
-    "sample_reference",
-]
-
 _UNLIMITED = 1e300  # Pinocchio's effort limits above this mean none
 # [s²] The effort limit accelerates a joint's own rotor by 1500 rad/s²: 0.1 kg·m² at 150 N·m.
 _ROTOR_INERTIA_PER_EFFORT = 1.0 / 1500.0

@@ -28,8 +28,6 @@ from vkc_pin.visualization.room import is_wall
 from vkc_pin.world.files.writing import check_writable, write_atomically
 from vkc_pin.world.scene.obstacles import FLOOR
 
-__all__ = ["RenderedScene", "open_gl_context", "write_snapshots", "write_video"]
-
 _SIZE = (640, 480)  # width and height of a snapshot [pixels]
 _MAX_RATE = 60.0  # frames per second of a video
 _MAX_SNAPSHOTS = 24  # snapshots in an image

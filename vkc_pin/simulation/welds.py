@@ -26,16 +26,6 @@ from vkc_pin.world.scene.hold import (
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = [
-    "Grip",
-    "Grips",
-    "Latches",
-    "compute_planned_freedoms",
-    "find_hold_spans",
-    "find_latches",
-    "measure_hand",
-]
-
 _AVERAGING_TIME = 0.02  # [s] of the moving average of forces: rubber yields, a weld does not
 _LATCH_TOLERANCE = 2e-3  # [rad] or [m] from the latched position within which a latch engages
 

@@ -17,21 +17,6 @@ import numpy as np
 from vkc_pin.errors import InputError, UnknownNameError, format_value
 from vkc_pin.utils.arrays import MAX_COORDINATE, Floats
 
-__all__ = [
-    "check_array",
-    "check_bool",
-    "check_choice",
-    "check_coordinate",
-    "check_finite_array",
-    "check_instance",
-    "check_integer",
-    "check_list",
-    "check_mapping",
-    "check_number",
-    "check_text",
-    "is_number",
-]
-
 T = TypeVar("T")
 MAX_ENTRIES = 100_000
 """Largest number of entries of a list."""

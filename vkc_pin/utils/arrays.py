@@ -9,16 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "MAX_COORDINATE",
-    "MIN_POSITIVE",
-    "Bools",
-    "Floats",
-    "Ints",
-    "find_unique_rows",
-    "replace_infinite",
-]
-
 MAX_COORDINATE = 1e4
 """Largest length [m] or angle [rad] in files and arguments."""
 MIN_POSITIVE = 1e-6

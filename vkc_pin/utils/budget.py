@@ -13,20 +13,6 @@ from typing import Literal, get_args
 
 from vkc_pin.utils.interrupt import handle_interrupt
 
-__all__ = [
-    "STOP_STATUSES",
-    "Budget",
-    "BudgetExhaustedError",
-    "StopStatus",
-    "count_evaluations",
-    "current_ending",
-    "enforce_share",
-    "record_evaluations",
-    "reserve_time",
-    "share_budget",
-    "suspend_budget",
-]
-
 StopStatus = Literal["interrupted", "evaluation limit", "time limit"]
 STOP_STATUSES: tuple[StopStatus, ...] = get_args(StopStatus)
 """Reasons to stop, which become the status of plans."""

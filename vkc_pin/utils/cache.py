@@ -11,8 +11,6 @@ from typing import Any, TypeVar, cast
 from vkc_pin.utils.budget import record_evaluations
 from vkc_pin.utils.system import release_freed_memory
 
-__all__ = ["Cache", "CacheInfo"]
-
 T = TypeVar("T")
 
 

@@ -8,14 +8,6 @@ import shlex
 import sys
 from collections.abc import Sequence
 
-__all__ = [
-    "EXIT_INTERRUPTED",
-    "EXIT_OK",
-    "parse_natural",
-    "parse_positive",
-    "report_interruption",
-]
-
 EXIT_OK = 0
 EXIT_INTERRUPTED = 130
 

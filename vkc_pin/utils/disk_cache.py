@@ -12,15 +12,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-__all__ = [
-    "CACHE_VARIABLE",
-    "TEMPORARY_PREFIX",
-    "find_cache_folder",
-    "is_private",
-    "load_or_build",
-    "write_private_file",
-]
-
 CACHE_VARIABLE = "VKC_PIN_CACHE"
 """Environment variable with the folder around the cache; empty or "off": no cache."""
 TEMPORARY_PREFIX = ".new-"

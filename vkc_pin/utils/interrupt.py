@@ -9,8 +9,6 @@ from collections.abc import Callable, Iterator
 from types import FrameType
 from typing import Any
 
-__all__ = ["defer_interrupt", "handle_interrupt", "raise_on_interrupt", "start_without_interrupt"]
-
 
 @contextlib.contextmanager
 def handle_interrupt(

@@ -23,15 +23,6 @@ from vkc_pin.errors import InputError
 from vkc_pin.utils.parallel import exit_with_parent, run_with_time_limit
 from vkc_pin.utils.system import limit_resource
 
-__all__ = [
-    "MEMORY_VARIABLE",
-    "TIME_VARIABLE",
-    "has_python",
-    "run_isolated",
-    "serve",
-    "submit_isolated",
-]
-
 T = TypeVar("T")
 TIME_VARIABLE = "VKC_PIN_PARSE_SECONDS"
 """Environment variable with the wall-clock time of one call [s]."""

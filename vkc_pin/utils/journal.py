@@ -20,8 +20,6 @@ from vkc_pin.utils.arguments import (
     check_text,
 )
 
-__all__ = ["CheckRecords", "Journal", "JournalContents", "Records"]
-
 CheckRecords = Callable[[str, list[dict[str, Any]]], object]
 """Raises an `InputError` for invalid records of a task, given its key and them."""
 

@@ -7,8 +7,6 @@ from functools import singledispatch
 from html import escape
 from importlib import import_module
 
-__all__ = ["in_notebook", "make_card", "register_card_module", "render_card"]
-
 _card_modules: list[str] = []
 
 

@@ -9,8 +9,6 @@ from typing import Any
 
 from vkc_pin.errors import BuildError, InputError
 
-__all__ = ["REBUILD_HINT", "explain_unfit_libraries", "import_compiled", "import_optional"]
-
 REBUILD_HINT = (
     "build vkc-pin again: pip install --force-reinstall --no-deps --no-cache-dir vkc-pin "
     "(in a checkout: '.')"

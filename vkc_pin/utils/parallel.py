@@ -23,16 +23,6 @@ from vkc_pin.errors import InputError, VkcError, format_value
 from vkc_pin.utils.interrupt import start_without_interrupt
 from vkc_pin.utils.optional_imports import import_optional
 
-__all__ = [
-    "MAX_CRASHES",
-    "CrashedTask",
-    "exit_with_parent",
-    "is_dask_installed",
-    "require_dask",
-    "run_tasks",
-    "run_with_time_limit",
-]
-
 MAX_CRASHES = 4
 """Number of processes that a task may crash on a cluster before it is given up."""
 _ADDRESS = re.compile(r"[a-z]+://[^/\s]+:\d{1,5}")

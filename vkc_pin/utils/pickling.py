@@ -9,8 +9,6 @@ from typing import Any, TypeVar
 
 import pinocchio as pin
 
-__all__ = ["freeze"]
-
 K = TypeVar("K")
 V = TypeVar("V")
 

@@ -12,22 +12,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-__all__ = [
-    "PACKAGES",
-    "count_cores",
-    "describe_machine",
-    "find_libc_version",
-    "find_processor_name",
-    "find_versions",
-    "has_screen",
-    "identify_process",
-    "is_file",
-    "limit_resource",
-    "measure_peak_memory",
-    "measure_resident_memory",
-    "release_freed_memory",
-]
-
 PACKAGES = ("vkc-pin", "pin", "coal", "casadi", "numpy")
 """The package and the dependencies that affect motions."""
 

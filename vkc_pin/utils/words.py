@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import re
 
-__all__ = ["list_words", "split_words"]
-
 
 def list_words(text: str) -> frozenset[str]:
     """Return the words of a text, for comparison with those of names."""

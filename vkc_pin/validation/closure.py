@@ -20,8 +20,6 @@ from vkc_pin.world.scene.hold import Hold, get_attachment
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["Drift", "find_drift"]
-
 RESOLUTION = 1e-6
 """Accuracy of a maximum: absolute up to 1 m or 1 rad, relative beyond."""
 PROVEN_FRACTION = 0.5

@@ -21,8 +21,6 @@ from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["Hit", "PairTable", "sweep"]
-
 _MOTION_TOLERANCE = 1e-9  # [m] or [rad]
 RESOLUTION = 1e-3  # largest penetration that may be missed between two samples [m]
 MIN_MOTION = 1e-6  # smaller relative motions between two samples are ignored [m]
@@ -425,6 +423,7 @@ class Intervals(NamedTuple):
     after: Floats
 
     def select(self, which: Bools) -> Intervals:
+        """Return some of the intervals."""
         return Intervals(
             self.low[which],
             self.high[which],

@@ -17,8 +17,8 @@ from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.tolerances import Tolerances
 from vkc_pin.world.models.gripper import WIDTH_TOLERANCE
+from vkc_pin.world.scene.clearance_exemptions import CONTACT_DEPTH
 from vkc_pin.world.scene.contact_rules import (
-    CONTACT_DEPTH,
     CONTACT_WINDOW,
     compute_grasp_opening,
     compute_hand_clearance,
@@ -31,8 +31,6 @@ from vkc_pin.world.scene.contact_rules import (
 from vkc_pin.world.scene.hold import Hold, get_attachment
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Grasp, Step, Touch
-
-__all__ = ["Window", "check_gripper", "check_pushes", "find_contact_windows"]
 
 _DWELL_TOLERANCE = 1e-6  # accepted shortfall of a rest [s]
 

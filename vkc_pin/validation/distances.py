@@ -20,8 +20,6 @@ from vkc_pin.world.models.coordinates import MovedJoint
 from vkc_pin.world.models.shapes import compute_bounding_box, compute_shape_distance
 from vkc_pin.world.trajectory.world_model import World
 
-__all__ = ["CollisionShapes", "PlacedShapes", "bound_displacements"]
-
 POINT_RADIUS = 1e-4  # radius of the sphere that stands for a point [m]
 
 

@@ -27,8 +27,6 @@ from vkc_pin.world.task.steps import (
     Touch,
 )
 
-__all__ = ["check_goals", "check_steps", "find_grasped_objects", "make_hold"]
-
 MOTION_TOLERANCE = 1e-5  # smaller displacements do not count as motion [m] or [rad]
 
 

@@ -18,14 +18,6 @@ from vkc_pin.world.trajectory.curve import sample_intervals
 from vkc_pin.world.trajectory.torques import MotionSamples, Torques, sample_curve
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = [
-    "TORQUE_TOLERANCE",
-    "MotorLoads",
-    "check_rates",
-    "check_rolling",
-    "find_limiting_constraints",
-]
-
 _MOTION_TOLERANCE = 1e-9  # relative to a limit
 _MIN_SHARE = 5e-3  # smaller shares of the duration are not reported
 ACCEPTED_RATE_TOLERANCE = 1e-3  # relative excess over a limit

@@ -18,8 +18,6 @@ from vkc_pin.world.scene.footing import Footing, find_footing
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 from vkc_pin.world.task.steps import Place, Release, Step
 
-__all__ = ["LoadCheck", "check_loads"]
-
 _MAX_FALL = 10.0  # [m] at which a fall counts that nothing ends
 
 

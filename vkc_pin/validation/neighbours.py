@@ -27,8 +27,6 @@ from vkc_pin.world.scene.clearance_exemptions import (
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import Scene
 
-__all__ = ["ExemptPairs", "find_exempt_pairs"]
-
 # [m] overlap of closed furniture that counts as an error of the model: kitchens of other packages
 # have up to 4.0 mm
 _BUILT_IN = 5e-3

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from vkc_pin.world.scene.scene import Scene
     from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["Bound", "CheckedMotion", "Exemption", "Report", "Violation"]
 
 AGREEMENT_TOLERANCE = 1e-5  # accepted difference of two checks of one motion [m] or [rad]
 _Check = Callable[[Any, str], Any]  # checks the value of a field

@@ -22,8 +22,6 @@ from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
-__all__ = ["ANGLE_STEP", "LENGTH_STEP", "MAX_SAMPLES", "Samples"]
-
 LENGTH_STEP, ANGLE_STEP = 5e-3, 1e-2  # largest step between two samples [m], [rad]
 CHORD_DEVIATION = 0.1  # largest deviation of a curve from its chord, as a fraction of the step
 MAX_SAMPLES = 100_000

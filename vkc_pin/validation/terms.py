@@ -13,8 +13,6 @@ from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
 from vkc_pin.world.task.terms import Constraint, Formula, Term
 
-__all__ = ["check_terms"]
-
 INTERMEDIATE_FACTOR = 10.0  # tolerance between waypoints over that at waypoints
 
 

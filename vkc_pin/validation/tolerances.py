@@ -6,8 +6,6 @@ from dataclasses import dataclass, fields
 
 from vkc_pin.utils.arguments import check_number
 
-__all__ = ["Tolerances"]
-
 
 @dataclass(frozen=True)
 class Tolerances:

@@ -37,8 +37,6 @@ from vkc_pin.world.task.terms import Term, trace_terms
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["check_arguments", "validate"]
-
 START_TOLERANCE = 1e-9  # difference from the scene's start [m] or [rad]
 LIMIT_TOLERANCE = 1e-5  # excess over a position limit [m] or [rad]
 LATCH_TOLERANCE = 1e-4

@@ -8,8 +8,6 @@ import numpy as np
 
 from vkc_pin.utils.arrays import Bools, Floats
 
-__all__ = ["FIELD_OF_VIEW", "LANDSCAPE", "PORTRAIT", "choose_viewpoint"]
-
 FIELD_OF_VIEW = 40.0
 """Vertical opening angle of the camera [degrees]."""
 LANDSCAPE = 1.5

@@ -43,8 +43,6 @@ from vkc_pin.world.trajectory.placements import Motion, sample_motion
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
-__all__ = ["Drawing"]
-
 _START, _END = (0.22, 0.42, 0.78), (0.10, 0.60, 0.38)  # of the ghosts
 _TOOL, _BASE = (0.88, 0.20, 0.35), (0.16, 0.42, 0.72)  # of the paths
 _PATH_STEP = 0.05  # between points of a path [rad], [m]: chords of 1 m radius are 0.3 mm off

@@ -15,8 +15,6 @@ from vkc_pin.world.files.meshes import load_parts
 from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.scene import Scene
 
-__all__ = ["Part", "Room", "is_wall", "load_drawn_parts"]
-
 # An upright box at most this thick that reaches at least this high is a wall [m].
 _THIN = 0.25
 _HIGH = 2.0

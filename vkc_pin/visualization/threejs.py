@@ -19,23 +19,6 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.meshes import MeshPart, simplify_mesh
 from vkc_pin.world.models.shapes import triangulate
 
-__all__ = [
-    "Ghost",
-    "Solid",
-    "Sun",
-    "Triangles",
-    "Unshadow",
-    "add_node",
-    "encode_colour",
-    "make_box",
-    "make_material",
-    "make_tube",
-    "merge_solids",
-    "shade",
-    "simplify",
-    "to_solid",
-]
-
 _CREASE = np.radians(35.0)  # faces that meet at a larger angle keep an edge between them
 _SIDES = 8  # of a tube
 _GRAIN = 2.0**-14  # rounding of vertices, for better compression [m]

@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
     from vkc_pin.visualization.drawing import Drawing
 
-__all__ = ["Recorder", "animate", "open_viewer", "render_page", "show", "to_html"]
 
 # Commands of a scene are 1.5 % larger than at level 9, which takes four times as long.
 _LEVEL = 6

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from vkc_pin.planning.kinematics import machine_code
-from vkc_pin.planning.kinematics.machine_code import CACHE_VARIABLE, Libraries
+from vkc_pin.planning.kinematics.machine_code import Libraries
+from vkc_pin.utils.disk_cache import CACHE_VARIABLE
 
 
 @pytest.fixture

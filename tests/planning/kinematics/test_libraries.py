@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from vkc_pin.planning.kinematics import machine_code
-from vkc_pin.planning.kinematics.machine_code import BUILD, CACHE_VARIABLE, Libraries, compile_jobs
-from vkc_pin.utils.disk_cache import TEMPORARY_PREFIX
+from vkc_pin.planning.kinematics.machine_code import BUILD, Libraries, compile_jobs
+from vkc_pin.utils.disk_cache import CACHE_VARIABLE, TEMPORARY_PREFIX
 
 LIBRARY = bytes(range(256)) * 40
 

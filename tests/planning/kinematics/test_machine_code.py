@@ -21,7 +21,6 @@ from vkc_pin.options import Options
 from vkc_pin.planning.kinematics import batch, machine_code
 from vkc_pin.planning.kinematics.batch import BatchFunction
 from vkc_pin.planning.kinematics.machine_code import (
-    CACHE_VARIABLE,
     Libraries,
     MachineCode,
     compile_jobs,
@@ -29,6 +28,7 @@ from vkc_pin.planning.kinematics.machine_code import (
 )
 from vkc_pin.planning.nlp.transcription import transcribe
 from vkc_pin.utils.cache import Cache
+from vkc_pin.utils.disk_cache import CACHE_VARIABLE
 from vkc_pin.world.task.steps import Grasp
 
 OPTIONS = Options(reach_waypoints=3, turn_waypoints=2, move_waypoints=3, contact_slots=2)

@@ -8,8 +8,6 @@ from typing import Any
 
 import yaml
 
-__all__ = ["make_card"]
-
 _ROWS = 12  # of reasons
 
 

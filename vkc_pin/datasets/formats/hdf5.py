@@ -47,17 +47,6 @@ from vkc_pin.world.trajectory.formats.archives import MotionSchema, ReportSchema
 if TYPE_CHECKING:
     import h5py
 
-__all__ = [
-    "Shard",
-    "make_part",
-    "make_parts",
-    "open_shard",
-    "read_episodes",
-    "read_numbers",
-    "read_scene",
-    "require_h5py",
-    "write_shard",
-]
 
 _OBSERVED = (
     *("base_pose", "base_velocity", "arm_position", "arm_velocity"),

@@ -13,8 +13,6 @@ import numpy as np
 from vkc_pin.errors import InputError, UnknownNameError, format_value
 from vkc_pin.utils.optional_imports import import_optional
 
-__all__ = ["MAX_BYTES", "Group", "open_hdf5", "require_h5py"]
-
 MAX_BYTES = 40_000_000
 """Largest array that is read [bytes]: 200 000 waypoints of 25 coordinates."""
 _MAX_TEXT = 50_000_000  # [bytes] of an attribute

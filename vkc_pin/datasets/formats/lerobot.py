@@ -25,8 +25,6 @@ from vkc_pin.world.files.documents import parse_json, read_text
 from vkc_pin.world.files.writing import MANIFEST, write_folder_atomically
 from vkc_pin.world.models.robot import Robot
 
-__all__ = ["VERSION", "describe_task", "find_differences", "require_pyarrow", "write_lerobot"]
-
 VERSION = "v3.0"
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _EPISODES = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"

@@ -11,8 +11,6 @@ from vkc_pin.datasets.episode import Episode, sample_times
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.robot import Robot
 
-__all__ = ["sample_episode"]
-
 
 def sample_episode(episode: Episode, robot: Robot, rate: float) -> Mapping[str, Floats]:
     """Return observations and actions at every sample, each of shape (N, k).

@@ -40,8 +40,6 @@ from vkc_pin.world.trajectory.splicing import concatenate_trajectories
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import compute_final_scene
 
-__all__ = ["FINER", "Attempt", "BaselineStep"]
-
 BaselineStep = Actuate | Place | GoTo | Reach
 
 FINER = 2

@@ -22,17 +22,6 @@ from vkc_pin.utils.budget import record_evaluations
 from vkc_pin.utils.optional_imports import import_optional
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = [
-    "CLEAR",
-    "QP",
-    "ArmKinematics",
-    "FailedError",
-    "FollowResult",
-    "follow",
-    "import_solvers",
-    "refine_configuration",
-]
-
 QP = "daqp"
 """Solver of quadratic programs, by its name in `qpsolvers`."""
 _ITERATIONS = 30

@@ -18,8 +18,6 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.coordinates import wrap_angle
 from vkc_pin.world.task.steps import GoTo
 
-__all__ = ["BasePaths", "find_goal_poses"]
-
 _STEPS, _STEP = 25, 0.08  # least number and largest distance [m] of checked poses on a line
 
 

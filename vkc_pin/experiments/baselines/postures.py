@@ -17,15 +17,6 @@ from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.solver.trust_region import CLEARANCE_TOLERANCE
 from vkc_pin.utils.arrays import Floats
 
-__all__ = [
-    "ENOUGH",
-    "TRIES",
-    "find_base_poses",
-    "generate_postures",
-    "interpolate_path",
-    "is_at_home",
-]
-
 ENOUGH = 50
 """Sufficient number of collision-free configurations."""
 TRIES = 20_000

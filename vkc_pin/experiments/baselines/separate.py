@@ -43,8 +43,6 @@ from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Step
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["BASELINES", "RETRIES", "plan_separately"]
-
 BASELINES = ("B1", "B2")
 RETRIES = 5
 """Number of attempts."""

@@ -10,23 +10,10 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.planning.plan import Plan
-from vkc_pin.utils.system import describe_machine, find_versions, measure_peak_memory
+from vkc_pin.utils.system import describe_machine, find_versions
 from vkc_pin.world.files.resources import find_package_folder
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.trajectory import Trajectory
-
-__all__ = [
-    "Record",
-    "Solve",
-    "compute_peaks",
-    "describe_environment",
-    "distribution",
-    "find_commit",
-    "find_versions",
-    "measure_peak_memory",
-    "trial",
-    "values",
-]
 
 Record = Mapping[str, Any]
 """Fields of a trial's record; see `trial`."""

@@ -17,25 +17,13 @@ import numpy as np
 from tqdm import tqdm
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.experiments.harness.record import describe_environment, measure_peak_memory
+from vkc_pin.experiments.harness.record import describe_environment
 from vkc_pin.experiments.harness.tables import to_csv
 from vkc_pin.utils.journal import Journal
 from vkc_pin.utils.parallel import CrashedTask, require_dask, run_tasks
+from vkc_pin.utils.system import measure_peak_memory
 from vkc_pin.world.files.resources import find_package_folder, find_resource_folder
 from vkc_pin.world.files.writing import check_links, check_writable, write_atomically
-
-__all__ = [
-    "LIMITS",
-    "MAX_EVALUATIONS",
-    "TIME_LIMIT",
-    "Execution",
-    "Function",
-    "check_folder",
-    "check_positive",
-    "describe_limit",
-    "run",
-    "select_names",
-]
 
 MAX_EVALUATIONS = 1_000_000
 """Several times the evaluations of a usual trial."""

@@ -13,8 +13,6 @@ from vkc_pin.planning.planner import plan
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Step
 
-__all__ = ["combine_records", "plan_step_by_step"]
-
 
 def plan_step_by_step(
     scene: Scene, steps: Sequence[Step], *, options: Options, seed: int

@@ -13,29 +13,6 @@ import numpy as np
 
 from vkc_pin.experiments.harness.record import Record, distribution
 
-__all__ = [
-    "EFFORTS",
-    "JUDGED",
-    "TIMES",
-    "comparison_table",
-    "compute_mean_and_deviation",
-    "compute_quartiles",
-    "compute_wilson_interval",
-    "count",
-    "count_failures",
-    "count_lower",
-    "count_timeouts",
-    "describe_run",
-    "find_common_successes",
-    "format_decimal",
-    "format_medians",
-    "format_table",
-    "join_sections",
-    "methods_table",
-    "select",
-    "to_csv",
-]
-
 EFFORTS = {
     "base_path_length": "base [m]",
     "base_path_length_l1": "base |dx|+|dy| [m]",

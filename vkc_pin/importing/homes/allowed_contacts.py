@@ -13,8 +13,6 @@ from vkc_pin.importing.objects.description import Description
 from vkc_pin.world.files.srdf import AllowedPairs, find_srdf, format_names, read_allowed_pairs
 from vkc_pin.world.files.xml import read_xml
 
-__all__ = ["HomeContacts", "read_home_contacts"]
-
 
 @dataclass(frozen=True, eq=False)
 class HomeContacts:

@@ -45,8 +45,6 @@ from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
 
-__all__ = ["ImportedHome", "find_free_start", "import_home"]
-
 _COMMAND = "import-home"
 _LARGEST = 1e3  # [m] largest height of a floor
 

@@ -24,8 +24,6 @@ from vkc_pin.importing.objects.clean_up import (
 from vkc_pin.importing.objects.description import Description, Joint, Link
 from vkc_pin.utils.arrays import Floats
 
-__all__ = ["FLOOR_RISE", "Home", "HomeObject", "add_floor", "split_home"]
-
 FLOOR_RISE = 0.02
 """Height up to which shapes are part of the floor [m]: slabs, carpets and thresholds."""
 _FLOOR_BEYOND = 2.0  # [m] of floor on sides without walls: a robot's length, and an arm's

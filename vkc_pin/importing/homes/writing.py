@@ -32,8 +32,6 @@ from vkc_pin.world.files.resources import choose_file_names
 from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.models.robot import Robot
 
-__all__ = ["ImportedHomeObject", "measure_parts", "write_object", "write_obstacles"]
-
 _LIFT = 0.2  # [m] by which a free object is lifted to test whether a hand can hold it
 
 

@@ -17,25 +17,6 @@ from vkc_pin.utils.arrays import Floats
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = [
-    "MOVING",
-    "Surfaces",
-    "choose_name",
-    "collect_attached_links",
-    "compute_bounds",
-    "extract_subtree",
-    "find_closed_positions",
-    "find_multiple_objects",
-    "fix_immovable_joints",
-    "load_surfaces",
-    "make_upright",
-    "merge_fixed_links",
-    "move_root",
-    "place_vertices",
-    "rename",
-    "rename_for_scenes",
-    "scale_object",
-]
 
 MOVING = ("revolute", "continuous", "prismatic")
 """Kinds of joints that have a position."""

@@ -20,18 +20,6 @@ from vkc_pin.world.files.meshes import load_mesh
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = [
-    "SOLIDS",
-    "WEIGHTLESS",
-    "Colour",
-    "Description",
-    "Joint",
-    "Link",
-    "Part",
-    "limit_follower",
-    "make_inertia",
-    "make_limits",
-]
 
 Colour = tuple[float, float, float, float]
 WEIGHTLESS = (

@@ -15,8 +15,6 @@ from vkc_pin.importing.objects.description import SOLIDS, Description, Joint
 from vkc_pin.world.files.meshes import make_convex_hull
 from vkc_pin.world.models.shapes import compute_shape_distance, compute_world_box
 
-__all__ = ["add_missing_limits"]
-
 _OPEN = np.pi / 2.0  # [rad] opening angle of hinges without limits
 _PULLED = 0.8  # travel of drawers without limits, relative to their depth
 _TINY_RANGE = 0.05  # [rad] hinge ranges below this suggest a wrong unit

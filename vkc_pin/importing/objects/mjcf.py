@@ -20,8 +20,6 @@ from vkc_pin.importing.objects.description import (
 from vkc_pin.importing.objects.mjcf_equalities import FREE, list_joints, read_equalities
 from vkc_pin.utils.optional_imports import import_optional
 
-__all__ = ["read_object_mjcf"]
-
 _HIDDEN = 3  # first group that MuJoCo's viewer hides; by convention, collision geometry
 
 

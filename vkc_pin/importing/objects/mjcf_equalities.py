@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["FREE", "Equalities", "list_joints", "read_equalities"]
-
 FREE = 0
 """Type of a free joint."""
 _DEGREE = 5  # coefficients of the polynomial of a coupling

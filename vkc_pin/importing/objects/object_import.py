@@ -58,8 +58,6 @@ from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
 
-__all__ = ["ImportedObject", "import_object", "read_description"]
-
 _COMMAND = "import-object"
 # Generic file names, which do not name an object
 _GENERAL = ("mobility", "model", "object", "scene", "index", "main")

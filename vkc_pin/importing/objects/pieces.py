@@ -19,7 +19,6 @@ from vkc_pin.world.files.hulls import SHEET_THICKNESS
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["PLACES_WORK", "MeshKeys", "PieceCache", "decompose_links", "measure_links"]
 
 # [m] Largest protrusion of pieces of moving links, about a finger's clearance from a handle
 _FINE = 0.006

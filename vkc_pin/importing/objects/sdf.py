@@ -35,8 +35,6 @@ from vkc_pin.world.files.meshes import load_mesh
 from vkc_pin.world.files.resources import find_mesh_file, iterate_address_candidates
 from vkc_pin.world.files.xml import find_line, make_element_error, parse_xml
 
-__all__ = ["read_object_sdf"]
-
 _NEWEST = 12  # minor version
 _MOST_MODELS = 5000
 # Of an <inertial> that does not state them, by the specification

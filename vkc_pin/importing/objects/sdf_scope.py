@@ -16,8 +16,6 @@ from vkc_pin.utils.arrays import MAX_COORDINATE
 from vkc_pin.world.files.kinematic_tree import parse_numbers
 from vkc_pin.world.files.xml import find_line, make_element_error
 
-__all__ = ["BASE", "RULES", "WORLD", "Rules", "Scope", "is_true"]
-
 WORLD = "world"
 """Name of the world in SDF."""
 BASE = "\0world"

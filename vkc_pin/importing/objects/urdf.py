@@ -31,8 +31,6 @@ from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.files.xml import read_xml
 from vkc_pin.world.models.couplings import find_followers
 
-__all__ = ["read_object_urdf"]
-
 _KINDS = ("fixed", "revolute", "continuous", "prismatic")
 
 

@@ -22,7 +22,6 @@ from vkc_pin.world.models.articulated_object import DEFAULT_VELOCITY
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["write_description", "write_urdf"]
 
 _EFFORT = 100.0  # [N], [N·m] effort limit, which other programs require
 _GREY: Colour = (0.75, 0.75, 0.75, 1.0)

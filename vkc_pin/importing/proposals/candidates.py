@@ -14,8 +14,6 @@ from vkc_pin.importing.proposals.hand import Hand
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.shapes import get_link_name, triangulate
 
-__all__ = ["Candidate", "Piece", "Section", "Thickness", "find_candidates"]
-
 DEEP = 0.06
 """Depth along the approach above which a piece is an edge rather than a bar [m]."""
 _DEPTH = 0.02  # [m] by which the tool's origin lies behind an edge

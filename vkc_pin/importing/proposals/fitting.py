@@ -17,16 +17,6 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.articulated_object import ArticulatedObject, Freedom
 from vkc_pin.world.models.shapes import compute_bounding_box, compute_shape_distance, get_link_name
 
-__all__ = [
-    "GraspMotion",
-    "HandClearance",
-    "Obstruction",
-    "Opening",
-    "find_named_handles",
-    "find_openings",
-    "score_grasp",
-]
-
 _WORDS = ("handle", "knob", "lever", "grip", "pull")
 _KINDS = {"bar": 1.0, "knob": 0.8, "edge": 0.4}
 _UNNAMED = 0.6  # factor for pieces that are not named as handles

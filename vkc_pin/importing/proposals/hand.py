@@ -17,8 +17,6 @@ from vkc_pin.world.models.gripper import (
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.shapes import compute_world_box, list_placed_shapes
 
-__all__ = ["Hand", "has_fingers", "make_hand"]
-
 _RIM = 0.005  # [m] ahead of the tool frame, largest height of a flange's rim
 
 Placed = tuple[coal.CollisionGeometry, pin.SE3]

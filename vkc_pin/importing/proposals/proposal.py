@@ -15,8 +15,6 @@ from vkc_pin.importing.targets import round_values
 from vkc_pin.utils.pickling import freeze
 from vkc_pin.world.models.articulated_object import ArticulatedObject, Attachment
 
-__all__ = ["Proposal", "Proposals"]
-
 _MAX_LISTED = 3  # other joints in a line
 
 

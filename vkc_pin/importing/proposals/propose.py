@@ -30,8 +30,6 @@ from vkc_pin.world.models.articulated_object import ArticulatedObject, Attachmen
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
 
-__all__ = ["propose_attachments"]
-
 _TRIED = 600  # grasps of one body that are checked with the hand, the best by geometry
 _RETREAT = 0.25  # [m] straight path along which a hand must be able to retreat
 _STEP = 0.015  # [m] step of that path

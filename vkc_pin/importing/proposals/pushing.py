@@ -12,8 +12,6 @@ from vkc_pin.importing.proposals.candidates import Piece
 from vkc_pin.importing.proposals.fitting import Opening
 from vkc_pin.utils.arrays import Floats
 
-__all__ = ["Push", "find_pushes"]
-
 _AREA = 4e-4  # [m²] smallest face: as of two fingertips
 _ALIGNED = 0.9  # smallest cosine between the inward normal and the motion of the face
 _FRACTIONS = (0.5, 0.25, 0.75, 0.1, 0.9)  # relative positions on a face

@@ -17,17 +17,6 @@ from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.models.robot_model import build_full_model, find_joint_limits
 from vkc_pin.world.models.wheels import has_wheel_name
 
-__all__ = [
-    "Arm",
-    "Body",
-    "build_body_tree",
-    "choose_arm",
-    "find_arms",
-    "find_own_base",
-    "find_telescopes",
-    "sample_points",
-]
-
 _MOVING = ("revolute", "continuous", "prismatic")
 _FINGER = 7  # largest number of joints of a finger
 _ARM = 3  # smallest number of joints of an arm with a hand; one more without a hand

@@ -35,8 +35,6 @@ from vkc_pin.world.models.robot_model import build_full_model
 from vkc_pin.world.models.shapes import compute_bounding_box
 from vkc_pin.world.models.wheels import describe_misplaced_axle, find_drive, is_on_axle
 
-__all__ = ["Diagnosis", "Finding", "doctor"]
-
 _SAMPLES = 200
 _CONCAVE = 0.03  # [m] protrusion of a hull above which it is reported
 _COUNTED = ("fault", "limitation", "warning")  # levels whose number is reported

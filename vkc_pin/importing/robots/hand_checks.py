@@ -13,15 +13,6 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.shapes import get_link_name, triangulate
 
-__all__ = [
-    "TASK_HEIGHTS",
-    "find_envelopes",
-    "find_grasp_heights",
-    "find_missing_tasks",
-    "remove_collision_shapes",
-    "should_reverse_tool",
-]
-
 _MIN_LINKS = 3  # smallest number of links of the hand: palm and two fingers
 _MIN_FRACTION = 0.5  # smallest enclosed fraction of the hand: fingertips may protrude
 _SLACK = 1e-3  # [m] by which an enclosed vertex may lie outside

@@ -27,8 +27,6 @@ from vkc_pin.world.models.robot_model import (
     make_configuration,
 )
 
-__all__ = ["Hand", "analyze_hand"]
-
 Positions = Mapping[str, float]  # of joints by name, [m] or [rad]
 
 _TIP = 0.025  # [m] length of a fingertip

@@ -16,8 +16,6 @@ from vkc_pin.world.files.meshes import load_mesh
 from vkc_pin.world.files.resources import choose_file_names
 from vkc_pin.world.files.urdf import UrdfFile, UrdfShape
 
-__all__ = ["Piece", "copy_meshes", "write_meshes"]
-
 # Protrusion of a hull over its mesh that is acceptable on a robot [m], and relative to the longest
 # edge of the mesh, since fingers are small
 _MAX_ERROR, _MAX_RELATIVE_ERROR = 0.02, 0.15

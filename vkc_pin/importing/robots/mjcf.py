@@ -23,8 +23,6 @@ from vkc_pin.utils.optional_imports import import_optional
 from vkc_pin.world.files.resources import choose_file_names
 from vkc_pin.world.files.xml import replace_forbidden
 
-__all__ = ["ConvertedRobot", "convert_mjcf", "solve_linkages"]
-
 _STEPS = 8  # steps of the driving joint from rest to either end of its range
 _GAP = 1e-3  # [m] largest distance at which a loop counts as closed
 _STIFFNESS = 1e-4  # weight of the distance from the previous configuration

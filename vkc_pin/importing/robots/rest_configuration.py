@@ -14,19 +14,6 @@ from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_model import find_nearest_position
 from vkc_pin.world.models.shapes import LinkDistances, ShapeDistances, triangulate
 
-__all__ = [
-    "HOME_ROOM",
-    "Clearances",
-    "Home",
-    "find_arm_positions",
-    "find_home",
-    "find_inseparable_pairs",
-    "find_nested_pairs",
-    "find_sunken_links",
-    "get_arm_bounds",
-    "measure_floor_heights",
-]
-
 HOME_ROOM = 0.03
 """Desired clearance between links and to the floor at home [m], above the default margin."""
 

@@ -67,8 +67,6 @@ from vkc_pin.world.models.robot_model import build_full_model
 from vkc_pin.world.models.self_collisions import sample_allowed_pairs, set_collision_pairs
 from vkc_pin.world.models.wheels import Drive, describe_misplaced_axle, find_drive, is_on_axle
 
-__all__ = ["PICTURE", "ImportedRobot", "import_robot"]
-
 PICTURE = "robot.png"
 """File name of a robot's picture."""
 _SAMPLES = 2000

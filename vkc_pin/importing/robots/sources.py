@@ -17,8 +17,6 @@ from vkc_pin.world.files.srdf import Srdf, SrdfState, find_srdf, read_srdf
 from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.files.xml import parse_xml
 
-__all__ = ["Source", "choose_free_name", "read_source"]
-
 # Elements of a URDF; others belong to simulators and controllers.
 _KEPT = ("link", "joint", "material")
 

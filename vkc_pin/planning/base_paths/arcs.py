@@ -16,8 +16,6 @@ from vkc_pin.planning.base_paths import reeds_shepp
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.models.coordinates import wrap_angle
 
-__all__ = ["Curves", "find_nearest_arc", "interpolate_arcs", "sample_path"]
-
 _RADIUS_FACTOR = 1.02  # chords of steps of 0.7 rad are 2 % shorter than their arcs
 _TURN_SAMPLES = 81  # turns that are compared
 _MAX_TURN_CHANGE = 0.8  # [rad] largest deviation from the requested turn

@@ -19,8 +19,6 @@ from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.collision.distances import compute_distance
 from vkc_pin.world.collision.solids import convert_solid, flatten_placements
 
-__all__ = ["DIRECTIONS", "MovingShapes", "Obstacles", "Shape", "compute_hull_points"]
-
 Shape = tuple[coal.CollisionGeometry, pin.SE3]
 """A convex shape and its placement."""
 

@@ -14,8 +14,6 @@ from vkc_pin.planning.base_paths.motion_primitives import Drive, SearchSpace
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.coordinates import wrap_angle
 
-__all__ = ["BasePath", "sample_poses", "shortest_path"]
-
 _SHORTCUT_SPACING = 0.5  # [m] spacing of the points between which shortcuts are tried
 _SAME = 1e-9
 

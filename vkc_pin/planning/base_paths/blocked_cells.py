@@ -19,8 +19,6 @@ from vkc_pin.planning.base_paths.base_clearance import DIRECTIONS, Shape, comput
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.utils.budget import record_evaluations
 
-__all__ = ["Lattice", "Solid", "SupportCache", "find_colliding_cells", "make_solids", "slice_solid"]
-
 _MIN_HEIGHT = 1e-6  # [m] below which shapes, and common heights of two shapes, are ignored
 _ROUNDING = 1e-5  # [m] rounding error of single precision
 _BATCH = 16  # outlines

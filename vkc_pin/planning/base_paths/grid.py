@@ -16,8 +16,6 @@ from vkc_pin.utils.budget import record_evaluations
 from vkc_pin.utils.cache import Cache
 from vkc_pin.utils.optional_imports import import_compiled
 
-__all__ = ["HEADINGS", "BaseGrid", "compute_fine_cell_count"]
-
 HEADINGS = 16
 """Number of headings: to a cell's eight neighbours and, between these, a knight's move away."""
 

@@ -27,8 +27,6 @@ from vkc_pin.utils.budget import record_evaluations
 from vkc_pin.utils.optional_imports import import_compiled
 from vkc_pin.world.models.coordinates import wrap_angle
 
-__all__ = ["find_cheapest_path"]
-
 _AHEAD, _BACK, _LEFT, _RIGHT = range(4)  # kinds of moves, as in `_driving.cpp`
 _BLOCKED, _NO_AHEAD, _NO_LEFT = 1, 2, 4  # flags of nodes
 _NONE = 2**60  # [UNIT] more than any path costs

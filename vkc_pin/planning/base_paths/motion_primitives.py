@@ -15,8 +15,6 @@ from vkc_pin.planning.base_paths.grid import BaseGrid
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.world.models.coordinates import wrap_angle
 
-__all__ = ["BACKWARDS", "SIDEWAYS", "UNIT", "Connections", "Drive", "SearchSpace"]
-
 BACKWARDS = 1.2
 """Cost of a metre driven backwards [m]."""
 SIDEWAYS = 5.0

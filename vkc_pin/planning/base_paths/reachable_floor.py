@@ -19,16 +19,6 @@ from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene
 
-__all__ = [
-    "CELL",
-    "CellGrid",
-    "InscribedDiscs",
-    "Wall",
-    "find_blocked_cells",
-    "find_free_floor",
-    "flood_fill",
-]
-
 CELL = 0.1
 """Size of the cells of `find_free_floor` [m]."""
 _BASE = 1  # joint number of a robot's base

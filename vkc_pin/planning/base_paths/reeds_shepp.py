@@ -12,8 +12,6 @@ import numpy as np
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.optional_imports import import_compiled
 
-__all__ = ["compute_lengths", "find_shortest_path_pieces"]
-
 _SAME = 1e-9
 
 

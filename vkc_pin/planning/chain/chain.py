@@ -30,15 +30,6 @@ from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.scene.support import SupportedObject
 
-__all__ = [
-    "Closure",
-    "Kinematics",
-    "VirtualKinematicChain",
-    "consolidate",
-    "get_kinematics",
-    "invert",
-]
-
 FREEDOM_VELOCITY = 1.0  # [rad/s] or [m/s], limit of a freedom of the grasp
 FREEDOM_ACCELERATION = 2.0
 

@@ -27,11 +27,11 @@ from vkc_pin.world.models.shapes import (
 )
 from vkc_pin.world.scene.clearance_exemptions import (
     ACCEPTED_SHORTFALL,
+    CONTACT_DEPTH,
     find_clearance_exemptions,
     make_shape_keys,
 )
 from vkc_pin.world.scene.contact_rules import (
-    CONTACT_DEPTH,
     CONTACT_WINDOW,
     compute_hand_clearance,
     find_grasp_distances,
@@ -46,13 +46,6 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.scene.support import SupportedObject
 from vkc_pin.world.task.lookup import find_joint_limits
 from vkc_pin.world.task.phases import Phase, Task
-
-__all__ = [
-    "REDUCED_MARGIN_RATIO",
-    "PhaseGeometry",
-    "build_phase_geometries",
-    "find_reduced_margins",
-]
 
 REDUCED_MARGIN_RATIO = 0.5  # margin relative to the distance at the contact
 ReducedMargins = dict[int, list[tuple[int, int, float]]]

@@ -28,8 +28,6 @@ from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Task
 
-__all__ = ["ContactModel", "Contacts", "make_empty_contacts"]
-
 # Tolerance of coal's distances. With coal's default of 1e-6, plane gradients have errors of up to
 # 5e-3; this value takes no longer.
 _DISTANCE_TOLERANCE = 1e-8

@@ -13,8 +13,6 @@ from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.utils.budget import record_evaluations
 from vkc_pin.utils.cache import Cache
 
-__all__ = ["MAX_STEP", "PoseSolver"]
-
 MAX_STEP = 0.5  # [m] or [rad]: maximum Gauss-Newton step of a coordinate
 
 

@@ -17,17 +17,6 @@ import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats
 
-__all__ = [
-    "POSE_OFFSET_SIZE",
-    "ROW_BOUNDS",
-    "PoseRow",
-    "build_pose_residual",
-    "build_pose_rows",
-    "compute_pose_offsets",
-    "flatten_target",
-    "relax_target",
-]
-
 ROW_BOUNDS: Mapping[str, tuple[Floats, Floats]] = {
     "pose": (
         np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]),

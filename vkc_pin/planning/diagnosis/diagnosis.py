@@ -18,18 +18,9 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.tolerances import Tolerances
 from vkc_pin.world.models.shapes import LIMIT_SLACK
-from vkc_pin.world.scene.clearance_exemptions import ACCEPTED_SHORTFALL
-from vkc_pin.world.scene.contact_rules import CONTACT_DEPTH
+from vkc_pin.world.scene.clearance_exemptions import ACCEPTED_SHORTFALL, CONTACT_DEPTH
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.task.steps import Actuate
-
-__all__ = [
-    "BlockedGoal",
-    "describe_free_range",
-    "diagnose_goal",
-    "diagnose_goals",
-    "find_impossible_conditions",
-]
 
 _MAX_BATCHES = 4  # batches of `SAMPLE_COUNT` random configurations before a goal counts as blocked
 _DEEP_SHORTFALL = 0.05  # [m], [rad] above which the solver cannot repair a goal configuration

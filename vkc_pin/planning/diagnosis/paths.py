@@ -18,8 +18,6 @@ from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Report
 
-__all__ = ["PathDiagnosis", "diagnose_paths"]
-
 _HEADINGS = 8  # base headings that are tried where the goal leaves the heading free
 
 

@@ -24,8 +24,6 @@ from vkc_pin.world.scene.clearance_exemptions import PlacedShapes, find_clearanc
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.task.phases import Phase
 
-__all__ = ["PROVEN", "find_proofs", "find_swept_collisions"]
-
 PROVEN = "proven: "
 """Prefix of the part of a note that is certain."""
 

@@ -16,8 +16,6 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.task.phases import FrameGoal, Phase
 
-__all__ = ["ApproachPaths"]
-
 _UP = np.array([0.0, 0.0, 1.0])
 
 

@@ -19,8 +19,6 @@ from vkc_pin.world.collision.solids import count_threads
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.obstacles import FLOOR
 
-__all__ = ["BaseRoutes", "collect_grid_shapes", "find_folded_arms"]
-
 _ARM_BASE = 2  # first joint of the arm in the model: joint 1 is the base
 # [m] from the ends of a path within which the arm approaches or retreats, and only the base counts
 _REACHING_RADIUS = 0.4

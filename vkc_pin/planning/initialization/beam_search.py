@@ -16,8 +16,6 @@ from vkc_pin.planning.initialization.keyframes import (
 from vkc_pin.planning.nlp.pose_goals import find_approach_waypoint
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 
-__all__ = ["BeamSearch", "SearchResult"]
-
 _BATCHES = 6  # maximum number of batches of random samples: good grasps are rare
 # number of collision-free configurations at a keyframe that ends sampling in open phases
 _ENOUGH_FREE = 60

@@ -20,12 +20,6 @@ from vkc_pin.planning.initialization.keyframes import (
 )
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 
-__all__ = [
-    "MAX_EXTENSIONS",
-    "find_closed_path",
-    "needs_trees",
-]
-
 MAX_EXTENSIONS = 3000
 """Maximum number of tree extensions."""
 _STEP = 0.15  # between collision checks, in the metric of searches: [rad] of a joint

@@ -13,14 +13,6 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.task.phases import PhaseKey
 from vkc_pin.world.trajectory.splicing import fill_missing_values
 
-__all__ = [
-    "InitialGuess",
-    "PhaseWaypoints",
-    "extract_phase_waypoints",
-    "make_initial_guess",
-    "perturb",
-]
-
 _DEEP = 0.1  # [m] penetration of a guess beyond which the solver seldom succeeds: 2 of 79
 # [m], [rad] initial trust region: a nearly feasible guess is improved in smaller steps
 _WARM_RADIUS = 0.2

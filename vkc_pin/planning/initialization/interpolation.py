@@ -19,16 +19,6 @@ from vkc_pin.planning.initialization.open_trees import Guide, OpenSearch
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.task.phases import Phase
 
-__all__ = [
-    "FIRST_CHECKS",
-    "AStarPaths",
-    "CurvePaths",
-    "Interpolator",
-    "Paths",
-    "RrtPaths",
-    "make_base_paths",
-]
-
 FIRST_CHECKS = 50_000
 """Collision checks after which the first search with trees ends."""
 

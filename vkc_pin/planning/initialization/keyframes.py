@@ -15,18 +15,6 @@ from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.world.scene.clearance_exemptions import ACCEPTED_SHORTFALL
 
-__all__ = [
-    "SAMPLE_COUNT",
-    "SIMILARITY_TOLERANCE",
-    "KeyframeCache",
-    "KeyframeSampler",
-    "compute_shortfall",
-    "find_free_configurations",
-    "interpolate_object_joints",
-    "sample_goal_configurations",
-    "sample_smoothstep",
-]
-
 SIMILARITY_TOLERANCE = 0.1  # [m], [rad] within which configurations are treated as the same
 SAMPLE_COUNT = 192  # random start configurations of inverse kinematics per keyframe
 _PUSHING_STEPS = 10  # maximum number of steps out of collision

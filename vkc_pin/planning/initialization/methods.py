@@ -24,14 +24,6 @@ from vkc_pin.planning.initialization.keyframes import (
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
 
-__all__ = [
-    "INITIALIZATIONS",
-    "MAX_GOOD_PENETRATION",
-    "Initialization",
-    "initialize",
-    "interleave_guesses",
-]
-
 Initialization = Literal["auto", "interpolated", "astar", "rrt", "stationary"]
 INITIALIZATIONS: tuple[Initialization, ...] = get_args(Initialization)
 MAX_GOOD_PENETRATION = 0.045

@@ -27,8 +27,6 @@ from vkc_pin.planning.initialization.keyframes import (
 )
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 
-__all__ = ["Guide", "OpenSearch"]
-
 _PIECE = 0.5  # longest edge of a tree, in the metric of searches: [rad] of a joint
 _CHECK_STEP, _FINE_STEP = 0.05, 0.01  # between collision checks while trees grow, and of the result
 _SAMPLES = 32  # towards which a tree grows at once

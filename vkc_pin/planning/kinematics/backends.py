@@ -14,8 +14,6 @@ import pinocchio as pin
 from vkc_pin.errors import BuildError
 from vkc_pin.utils.optional_imports import REBUILD_HINT, import_compiled
 
-__all__ = ["build_compiled", "build_upstream", "check_versions"]
-
 
 def build_compiled(name: str, model: pin.Model, *arguments: Any) -> casadi.Function:
     """Return the named function, built by the compiled module.

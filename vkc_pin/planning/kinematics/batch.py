@@ -11,8 +11,6 @@ import numpy as np
 from vkc_pin.planning.kinematics.machine_code import MachineCode
 from vkc_pin.utils.arrays import Floats
 
-__all__ = ["BatchFunction", "estimate_size"]
-
 _MAX_BUFFERS = 16  # batch sizes with cached buffers
 _BATCH_MULTIPLE = 16  # batch sizes are rounded up to multiples of this
 # Executed instructions (20 ms) after which machine code of a function is requested.

@@ -28,7 +28,6 @@ import casadi as ca
 import numpy as np
 
 from vkc_pin.utils.disk_cache import (
-    CACHE_VARIABLE,
     TEMPORARY_PREFIX,
     find_cache_folder,
     is_private,
@@ -36,16 +35,6 @@ from vkc_pin.utils.disk_cache import (
 )
 from vkc_pin.utils.isolation import has_python
 from vkc_pin.utils.system import find_libc_version
-
-__all__ = [
-    "BUILD",
-    "CACHE_VARIABLE",
-    "Libraries",
-    "MachineCode",
-    "compile_jobs",
-    "find_compiler",
-    "wait",
-]
 
 BUILD = ".build-"
 """Start of the names of folders in which libraries are compiled."""

@@ -21,8 +21,6 @@ from vkc_pin.world.task.phases import summarize_phases
 from vkc_pin.world.task.steps import Step
 from vkc_pin.world.task.terms import Term, check_terms_active, trace_terms
 
-__all__ = ["Plane", "build", "patterns", "planes", "sizes"]
-
 _EXTRA_REACH = 0.3  # [m]: distances larger than the plane's by more than this are not computed
 
 

@@ -10,8 +10,6 @@ import numpy as np
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.budget import BudgetExhaustedError, record_evaluations
 
-__all__ = ["BYTES_PER_ENTRY", "Ipopt", "Monitor", "make_ipopt"]
-
 _MEMORY_INDEX = 1  # CasADi reserves memory 0 of a function; the buffer gets the next one
 # [bytes] per nonzero of Jacobian or Hessian, in program and solver together, measured on the door
 BYTES_PER_ENTRY = 600

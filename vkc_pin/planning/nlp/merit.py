@@ -13,16 +13,6 @@ from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.nlp.timing import Timing
 from vkc_pin.utils.arrays import Floats
 
-__all__ = [
-    "GROWTH",
-    "MAX_WEIGHT",
-    "TOLERANCE",
-    "Infeasibility",
-    "Merit",
-    "compute_shortfalls",
-    "measure_infeasibility",
-]
-
 # [m], [rad], and relative to the limits for rates: tolerance of all constraints except clearance
 TOLERANCE = 1e-4
 GROWTH = 4.0  # factor by which a weight grows if it proved too small

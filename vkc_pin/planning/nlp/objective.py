@@ -9,8 +9,6 @@ import numpy as np
 
 from vkc_pin.utils.arrays import Floats, Ints
 
-__all__ = ["MotionCost", "find_change_steps"]
-
 # [m] and [rad]: shorter displacements of a coordinate in a phase count as squares, because the
 # length is not differentiable at zero
 SMOOTHING_LENGTH = 0.03

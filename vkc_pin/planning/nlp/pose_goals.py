@@ -15,16 +15,6 @@ from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Phase, Task
 
-__all__ = [
-    "PoseGoal",
-    "find_approach_waypoint",
-    "find_chosen_freedoms",
-    "find_end_of_hold",
-    "find_phase_spans",
-    "find_pushed_coordinates",
-    "make_pose_goals",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class PoseGoal:

@@ -37,8 +37,6 @@ from vkc_pin.world.task.phases import Phase, Task
 from vkc_pin.world.task.terms import Term
 from vkc_pin.world.trajectory.wheels import make_rolling_limits
 
-__all__ = ["TrajectoryProblem"]
-
 # Relative cost of coordinates that are chosen at the grasp and constant afterwards; it only
 # regularises the problem.
 _CHOSEN_FREEDOM_WEIGHT = 1e-4

@@ -10,8 +10,6 @@ import numpy as np
 
 from vkc_pin.utils.arrays import Floats, Ints
 
-__all__ = ["assemble", "get_pattern", "make_curvature", "make_differences", "make_sparse"]
-
 
 def get_pattern(matrix: ca.SX) -> tuple[Ints, Ints]:
     """Return rows and columns of a matrix's nonzeros, in the order of `matrix.nonzeros()`."""

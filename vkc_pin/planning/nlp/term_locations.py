@@ -20,8 +20,6 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Task, summarize_phases
 from vkc_pin.world.task.terms import Cost, Term
 
-__all__ = ["TermEvaluator", "locate_terms"]
-
 # factor by which steps are lengthened at a time, and its maximum in total
 _STRETCH_FACTOR, _MAX_STRETCH = 1.2, 8.0
 # Scaled violation of a term that is violated by its tolerance, comparable to pose residuals.

@@ -21,8 +21,6 @@ from vkc_pin.utils.cache import Cache
 from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.task.terms import Formula
 
-__all__ = ["FrameLocation", "TermLocation", "TermProgram", "TermRow", "Tree", "Value"]
-
 
 @dataclass(frozen=True)
 class Value:

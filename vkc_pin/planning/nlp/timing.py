@@ -11,8 +11,6 @@ import numpy as np
 
 from vkc_pin.utils.arrays import Floats
 
-__all__ = ["Timing", "compute_step_times", "split_at_stops"]
-
 # Factor by which a motion may be slowed down before rate limits become rows of the program.
 _MAX_STRETCH = 1.5
 _DURATION_MARGIN = 1.15  # Duration relative to the profile 3s² − 2s³ along the initial guess.

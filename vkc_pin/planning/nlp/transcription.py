@@ -30,8 +30,6 @@ from vkc_pin.utils.budget import record_evaluations
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.models.coordinates import Coordinates
 
-__all__ = ["Transcription", "transcribe"]
-
 
 class Transcription:
     """Symbols, functions and Ipopt solvers of the program of one `Structure`, reused between tasks.

@@ -25,8 +25,6 @@ from vkc_pin.utils.cache import Cache
 from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.trajectory.wheels import OMNIDIRECTIONAL, RollingLimits
 
-__all__ = ["StepRows", "Structure", "WaypointFunctions", "get_waypoint_functions"]
-
 # Minimum number of waypoints of one kind for which compilation pays off. Most kinds occur once, at
 # a grasp, or about thirty times.
 _MIN_WAYPOINTS_TO_COMPILE = 4

@@ -9,8 +9,6 @@ from numpy.typing import ArrayLike
 
 from vkc_pin.utils.arrays import Floats
 
-__all__ = ["CubicPath", "compute_natural_slopes"]
-
 
 class CubicPath:
     """A cubic Hermite spline of n coordinates, extrapolated by its outermost cubics.

@@ -15,8 +15,6 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.curve import Curve, sample_intervals
 from vkc_pin.world.trajectory.wheels import RollingLimits
 
-__all__ = ["Limits", "limit_jerk"]
-
 _ROUNDING = 1e-9  # relative
 # averaging intervals, as multiples of the time in which an acceleration may build up
 _SPAN_FACTORS = np.geomspace(0.25, 4.0, 9)

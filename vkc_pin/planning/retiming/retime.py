@@ -23,8 +23,6 @@ from vkc_pin.world.trajectory.torques import Torques
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.wheels import RollingLimits, make_rolling_limits
 
-__all__ = ["Close", "retime_trajectory"]
-
 _MIN_PIECES = 3  # minimum pieces per step; the path velocity is linear in time in each
 _MIN_JOINT_STEP = 1e-6  # [m] or [rad], smaller steps of an object's joint count as none
 _MIN_STEP_DURATION = 1e-6  # [s] at full speed; shorter steps count as none

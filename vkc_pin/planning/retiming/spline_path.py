@@ -8,8 +8,6 @@ from vkc_pin.planning.retiming.cubic_path import CubicPath, compute_natural_slop
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.trajectory.curve import Curve
 
-__all__ = ["fit_path"]
-
 
 def fit_path(points: Floats, scale: Floats, limits: tuple[Floats, Floats]) -> CubicPath:
     """Return a cubic spline through waypoints, parametrised by the length of the polyline.

@@ -16,8 +16,6 @@ import numpy as np
 from vkc_pin.planning.retiming.cubic_path import CubicPath
 from vkc_pin.utils.arrays import Floats, Ints
 
-__all__ = ["compute_speeds"]
-
 # Offsets of constrained points from the ends of segments, where accelerations jump, relative to the
 # length; the second one is tried if the first fails.
 _KNOT_OFFSETS = (1e-3, 1e-2)

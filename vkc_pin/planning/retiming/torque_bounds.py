@@ -11,8 +11,6 @@ from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.torques import Torques, sample_curve
 
-__all__ = ["PathTorques", "TorqueBounds"]
-
 # Maximum slowdown; if even this does not suffice, the limits are exceeded at rest.
 _MAX_SLOWDOWN = 10.0
 _SLOWDOWNS = (1.0, 2.0, 4.0)  # slowdowns at which torques are sampled

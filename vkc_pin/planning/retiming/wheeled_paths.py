@@ -12,8 +12,6 @@ from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.world.trajectory.curve import Curve, sample_intervals
 from vkc_pin.world.trajectory.wheels import RollingLimits, rotate_into_base_frame
 
-__all__ = ["compute_slip", "fit_rolling_paths"]
-
 _MIN_PIECES = 3  # per step
 _MAX_TURN_PER_PIECE = 0.05  # [rad]
 _NEWTON_ITERATIONS = 12

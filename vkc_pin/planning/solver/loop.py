@@ -36,8 +36,6 @@ from vkc_pin.planning.solver.trust_region import (
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.budget import STOP_STATUSES, BudgetExhaustedError, record_evaluations
 
-__all__ = ["solve"]
-
 # [m], [rad] violation of clearance, or of closures, goals and grasps, up to which a trajectory
 # counts as nearly feasible
 NEARLY_FEASIBLE = 0.01

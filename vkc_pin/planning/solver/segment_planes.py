@@ -12,15 +12,6 @@ from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.solver.trust_region import CLEARANCE_TOLERANCE
 from vkc_pin.utils.arrays import Floats, Ints
 
-__all__ = [
-    "Crossing",
-    "SegmentContacts",
-    "find_crossings",
-    "find_new_crossings",
-    "find_segment_contacts",
-    "merge_contacts",
-]
-
 SPACING = 0.02  # [m] or [rad] between the first samples, in the coordinate that moves most
 SEGMENT_MARGIN = 1e-2  # [m] clearance required between waypoints
 REFINEMENT_RANGE = 0.015  # [m] beyond `SEGMENT_MARGIN` within which samples are refined

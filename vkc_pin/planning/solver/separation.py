@@ -14,8 +14,6 @@ from vkc_pin.planning.solver.segment_planes import Crossing, merge_contacts
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.world.models.shapes import triangulate
 
-__all__ = ["Separation"]
-
 SHALLOW = 0.01  # [m] penetration up to which opposite normals of a stretch are ignored
 SAME_DIRECTION = 0.99  # cosine above which two candidate directions count as one
 PUSHES = 6  # Gauss-Newton steps that separate a stretch in one direction

@@ -6,8 +6,6 @@ from dataclasses import dataclass, field
 
 from vkc_pin.utils.arrays import Floats
 
-__all__ = ["Iteration", "Solution"]
-
 
 @dataclass(frozen=True)
 class Iteration:

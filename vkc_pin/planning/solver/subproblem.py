@@ -16,8 +16,6 @@ from vkc_pin.planning.solver.solution import Solution
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.optional_imports import import_compiled
 
-__all__ = ["Step", "Subproblem", "make_linear_solver_options"]
-
 _IPOPT: Mapping[str, Any] = {
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",

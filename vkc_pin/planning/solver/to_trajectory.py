@@ -10,8 +10,6 @@ from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["close_chains", "make_trajectory"]
-
 
 def make_trajectory(problem: TrajectoryProblem, z: Floats, dt: Floats) -> Trajectory:
     """Convert z_1..z_N, shape (N, n), with step durations dt, shape (N,) [s], to a trajectory.

@@ -7,8 +7,6 @@ import numpy as np
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.scene.clearance_exemptions import ACCEPTED_SHORTFALL
 
-__all__ = ["TrustRegion", "is_step_acceptable"]
-
 BLOCK_TIME = 2.5  # [s] of motion that share a radius, at one waypoint per `Options.dt`
 FIRST_RADIUS = 0.5  # [m], [rad] initial radius, also after the penalty weights were raised
 # fraction of the radius above which a step counts as limited by the trust region (Ipopt ends a

@@ -17,16 +17,6 @@ import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats
 
-__all__ = [
-    "LinkBuilder",
-    "ObjectBuilder",
-    "Point",
-    "Sampler",
-    "add_knob",
-    "add_level_bar",
-    "add_upright_bar",
-]
-
 T = TypeVar("T")
 Point = Sequence[float]
 

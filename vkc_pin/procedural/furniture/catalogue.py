@@ -20,8 +20,6 @@ from vkc_pin.world.files.resources import check_path
 from vkc_pin.world.files.writing import check_writable, write_atomically
 from vkc_pin.world.models.object_file import load_object
 
-__all__ = ["KINDS", "Kind", "random_object", "write_object"]
-
 
 @dataclass(frozen=True)
 class Kind:

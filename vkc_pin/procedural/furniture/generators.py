@@ -15,19 +15,6 @@ from vkc_pin.procedural.furniture.building import (
     add_upright_bar,
 )
 
-__all__ = [
-    "make_cabinet",
-    "make_chest",
-    "make_dishwasher",
-    "make_door",
-    "make_drawers",
-    "make_faucet",
-    "make_microwave",
-    "make_oven",
-    "make_refrigerator",
-    "make_valve",
-]
-
 _GAP = 0.006  # [m] between a door or drawer and its case
 _POST = 0.05  # [m] width of a door's posts
 _AIR = 0.025  # [m] between a door's panel and its frame: more than a plan's clearance

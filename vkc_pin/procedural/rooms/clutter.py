@@ -18,8 +18,6 @@ from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene
 
-__all__ = ["add_clutter"]
-
 _MAX_TRIES = 200  # places for one object
 _GAP = 0.002  # [m] between an object and all shapes but its support
 _REACH = 0.15  # [m] radius around free objects that stays clear for a hand

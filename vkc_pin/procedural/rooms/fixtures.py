@@ -21,16 +21,6 @@ from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 
-__all__ = [
-    "OPENABLE",
-    "RANDOM",
-    "Counter",
-    "Fixture",
-    "list_openable_types",
-    "make_fixture",
-    "make_fixture_name",
-]
-
 OPENABLE = {
     "door": 0.4,
     "narrow_door": 0.4,

@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.utils.arrays import Floats
 
-__all__ = ["Floor", "Frame", "Rectangle"]
-
 _CELL = 0.1  # [m] of the grid for path searches
 _QUARTERS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
 

@@ -11,17 +11,6 @@ import numpy as np
 from vkc_pin.procedural.rooms.fixtures import Fixture
 from vkc_pin.procedural.rooms.footprints import Floor, Frame, Rectangle
 
-__all__ = [
-    "CARRIED",
-    "Part",
-    "make_box",
-    "make_carried_object",
-    "make_openable",
-    "make_shelf",
-    "make_table",
-    "make_walls",
-]
-
 WALL = 0.1  # [m] thickness
 AIR = 0.02  # [m] between a wall and the parts against it
 PLATE, LEG, BOARD = 0.03, 0.06, 0.02  # [m] thicknesses

@@ -38,8 +38,6 @@ from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene
 
-__all__ = ["Layout", "RoomSettings", "random_room", "sample_layout"]
-
 _MAX_CARRIED = 4  # on one table
 _MAX_TRIES = 60  # places for one part
 _MAX_ROOMS = 60  # rooms that are started because a part of the one before did not fit

@@ -18,8 +18,6 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
-__all__ = ["motion_html", "scene_html"]
-
 _SIDE = 4.4  # [inch], longer side of the picture
 _DPI = 72
 _COLOURS = 96  # of its palette

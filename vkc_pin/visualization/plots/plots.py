@@ -39,20 +39,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, FigureBase
 
-__all__ = [
-    "DASHES",
-    "PICTURES",
-    "SAMPLES",
-    "ClearanceCurve",
-    "compute_clearance_curves",
-    "draw_joints",
-    "find_groups",
-    "name_phases",
-    "plot",
-    "plot_clearance",
-    "plot_joints",
-    "plot_top_view",
-]
 
 _KINDS = (
     "robot – itself",

@@ -25,7 +25,6 @@ from vkc_pin.world.trajectory.world_model import World
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Approach", "plot_scene"]
 
 _ARROW = 0.35  # [m]
 _MARGIN, _BEYOND = 0.3, 0.1  # [m] around the content, and around labels

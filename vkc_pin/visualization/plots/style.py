@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
     from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["COLOURS", "STYLE", "new_figure", "save_figure", "shade_phases", "use_style"]
 
 COLOURS = ("#2f6db5", "#d1495b", "#2a9d6f", "#e08e1b", "#7a5195", "#5b6770", "#1b9aaa", "#a44a3f")
 """Colours of lines and bars, in this order."""

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import FigureBase
 
-__all__ = ["compute_outline", "draw_top_view"]
 
 _STEP = 0.55  # travel between two drawn footprints [m]
 _ROBOT_HEIGHT = 1.8  # obstacles above this height are drawn dashed [m]

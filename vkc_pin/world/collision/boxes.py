@@ -12,8 +12,6 @@ import numpy as np
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.world.collision.solids import load_compiled
 
-__all__ = ["Boxes", "WorldBoxes"]
-
 
 class Boxes:
     """Oriented bounding boxes of G shapes: first the moving ones, then those fixed in the world.

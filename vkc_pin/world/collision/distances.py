@@ -23,18 +23,6 @@ from vkc_pin.world.collision.solids import (
     load_compiled,
 )
 
-__all__ = [
-    "TOLERANCE",
-    "Clearances",
-    "ClosePairs",
-    "MarginRegion",
-    "Margins",
-    "Shapes",
-    "Witnesses",
-    "compute_distance",
-    "count_distance_queries",
-]
-
 TOLERANCE = 1e-6  # coal's default tolerance of GJK
 _MIN_PAIRS_PER_THREAD = 128  # distances, about 0.2 ms: fewer do not pay for another thread
 _ROUNDING = 1e-6  # [m] numerical error of coal's distances

@@ -18,14 +18,6 @@ from vkc_pin.utils.optional_imports import REBUILD_HINT, import_compiled
 from vkc_pin.utils.system import count_cores
 from vkc_pin.world.files.meshes import get_triangles
 
-__all__ = [
-    "ShapePlacements",
-    "convert_solid",
-    "count_threads",
-    "flatten_placements",
-    "load_compiled",
-]
-
 _MAX_THREADS = 8
 _cache: dict[int, tuple[weakref.ref[Any], bytes, float, Any]] = {}  # by the id of the shape
 _SIZE = 12

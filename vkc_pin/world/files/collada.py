@@ -21,8 +21,6 @@ from vkc_pin.world.files.documents import read_bytes
 from vkc_pin.world.files.polygons import triangulate_polygon, triangulate_polygons
 from vkc_pin.world.files.xml import find_line, make_element_error, parse_xml
 
-__all__ = ["read_collada"]
-
 _MAX_FILE_SIZE = 500_000_000  # [bytes], of which the parsed file takes about six times
 # Triangles of a file: a few lines of nodes that show each other twice grow without bound.
 _MAX_TRIANGLES = 5_000_000

@@ -16,17 +16,6 @@ import yaml
 
 from vkc_pin.errors import InputError, UnknownNameError, format_value
 
-__all__ = [
-    "Document",
-    "format_field",
-    "parse_document",
-    "parse_json",
-    "read_bytes",
-    "read_head",
-    "read_text",
-    "read_yaml",
-]
-
 MAX_FILE_SIZE = 50_000_000
 """Largest description file [bytes]."""
 MAX_FIELDS = 300_000

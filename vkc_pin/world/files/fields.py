@@ -12,21 +12,6 @@ from pydantic_core import PydanticCustomError
 
 from vkc_pin.utils.arrays import MAX_COORDINATE, MIN_POSITIVE
 
-__all__ = [
-    "JointSchema",
-    "Name",
-    "NonNegative",
-    "Number",
-    "Positive",
-    "Quaternion",
-    "Schema",
-    "Vector3",
-    "make_validation_error",
-    "require",
-    "require_length",
-    "wrap_text",
-]
-
 
 def make_validation_error(problem: str, expected: str) -> PydanticCustomError:
     """Return the error of a validator."""

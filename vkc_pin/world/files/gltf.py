@@ -14,8 +14,6 @@ import numpy as np
 
 from vkc_pin.errors import InputError
 
-__all__ = ["GLTF_SUFFIXES", "GLTF_TO_Z_UP", "check_gltf"]
-
 GLTF_SUFFIXES = (".gltf", ".glb")
 """Extensions of glTF files in lower case."""
 GLTF_TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], float)

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     import trimesh
     from scipy.spatial import ConvexHull
 
-__all__ = ["SHEET_THICKNESS", "compute_hull", "compute_outer_hull", "thicken"]
 
 SHEET_THICKNESS = 1e-3
 """Thickness of flat parts, such as pictures and rugs [m]."""

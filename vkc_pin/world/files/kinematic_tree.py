@@ -17,16 +17,6 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.utils.arrays import MAX_COORDINATE, MIN_POSITIVE
 from vkc_pin.world.files.xml import find_line, make_element_error, replace_forbidden
 
-__all__ = [
-    "MOMENTS",
-    "check_tree",
-    "find_roots",
-    "parse_inertial",
-    "parse_numbers",
-    "parse_origin",
-    "simplify_tree",
-]
-
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 """Attributes of <inertia>, along the rows of the upper triangle."""
 _MAX_MASS = 1e9  # [kg], and of moments of inertia [kg·m²]

@@ -44,16 +44,6 @@ from vkc_pin.world.files.resources import check_path
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = [
-    "MeshPart",
-    "get_triangles",
-    "load_convex",
-    "load_mesh",
-    "load_parts",
-    "make_bvh",
-    "make_convex_hull",
-    "simplify_mesh",
-]
 
 _MAX_NEIGHBOURS = 255  # coal's corners have no more
 _MAX_CACHED_HULLS = 512  # that a process keeps: robots are loaded again and again

@@ -17,8 +17,6 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.files.polygons import triangulate_polygons
 
-__all__ = ["divide_polygons", "is_plain_obj", "normalize_obj", "read_off"]
-
 # Faces of OBJ files whose corners count from the end, or from 0
 _NOT_FROM_ONE = re.compile(rb"\nf[^\n]*[ /][-0]")
 # Comments behind the numbers of a line

@@ -9,8 +9,6 @@ import numpy as np
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.utils.optional_imports import import_optional
 
-__all__ = ["triangulate_polygon", "triangulate_polygons"]
-
 # Cross products of edges, relative to the polygon's area vector, that count as straight: corners
 # that lie on a side
 _STRAIGHT = 1e-9

@@ -17,20 +17,6 @@ import pinocchio as pin
 from vkc_pin.errors import InputError, UnknownNameError, find_nearest_name, format_value
 from vkc_pin.utils.system import is_file
 
-__all__ = [
-    "check_path",
-    "choose_file_names",
-    "find_example_robot_data",
-    "find_file",
-    "find_mesh_file",
-    "find_package",
-    "find_package_folder",
-    "find_resource",
-    "find_resource_folder",
-    "iterate_address_candidates",
-    "list_resources",
-]
-
 _MAX_NAME_LENGTH = (
     64  # characters of a file name without extension; file systems take 255 bytes with it
 )

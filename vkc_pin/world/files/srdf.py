@@ -15,17 +15,6 @@ from pathlib import Path
 from vkc_pin.errors import InputError
 from vkc_pin.world.files.xml import find_line, read_xml
 
-__all__ = [
-    "AllowedPairs",
-    "Srdf",
-    "SrdfGroup",
-    "SrdfState",
-    "find_srdf",
-    "format_names",
-    "read_allowed_pairs",
-    "read_srdf",
-]
-
 Pair = tuple[str, str]
 _HOMES = ("home", "default", "rest")  # names of states of rest, the preferred one first
 _LISTED = 6  # names in a note

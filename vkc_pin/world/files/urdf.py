@@ -23,7 +23,6 @@ from vkc_pin.world.files.xml import make_element_error, read_xml
 if TYPE_CHECKING:
     import trimesh
 
-__all__ = ["UrdfFile", "UrdfShape", "build_model", "load_urdf", "read_urdf"]
 
 Colour = tuple[float, float, float, float]
 _LIGHT_GREY: Colour = (0.9, 0.9, 0.9, 1.0)

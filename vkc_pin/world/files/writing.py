@@ -18,20 +18,6 @@ from vkc_pin.utils.interrupt import defer_interrupt
 from vkc_pin.world.files.documents import parse_json, read_text
 from vkc_pin.world.files.resources import check_path
 
-__all__ = [
-    "MANIFEST",
-    "check_inside",
-    "check_links",
-    "check_name",
-    "check_outputs",
-    "check_replaceable",
-    "check_writable",
-    "is_leftover",
-    "remove_leftovers",
-    "write_atomically",
-    "write_folder_atomically",
-]
-
 MANIFEST = ".vkc-pin.json"
 """File that lists the other files in a folder of `write_folder_atomically`."""
 _LEFTOVER = re.compile(r"\.vkc-pin-[0-9a-f]{16}")  # names of `_make_temporary_path`

@@ -11,15 +11,6 @@ from xml.parsers import expat
 from vkc_pin.errors import InputError
 from vkc_pin.world.files.documents import read_text
 
-__all__ = [
-    "find_line",
-    "make_element_error",
-    "parse_xml",
-    "quote",
-    "read_xml",
-    "replace_forbidden",
-]
-
 _MAX_DEPTH = 200  # of elements inside each other: Python writes and copies them recursively
 _FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 

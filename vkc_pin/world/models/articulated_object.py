@@ -20,15 +20,6 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.dynamics import Resistance, compute_mass
 
-__all__ = [
-    "DEFAULT_ACCELERATION",
-    "DEFAULT_VELOCITY",
-    "ArticulatedObject",
-    "Attachment",
-    "Freedom",
-    "Latch",
-]
-
 DEFAULT_VELOCITY = 1.0
 """Velocity limit of object joints whose URDF has none [rad/s] or [m/s]."""
 DEFAULT_ACCELERATION = 2.0

@@ -16,8 +16,6 @@ from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import check_array, check_choice
 from vkc_pin.utils.arrays import Bools, Floats
 
-__all__ = ["Coordinates", "MovedJoint", "wrap_angle"]
-
 _SLIDING = ("JointModelPX", "JointModelPY", "JointModelPZ", "JointModelPrismaticUnaligned")
 _UNBOUNDED = (
     "JointModelRUBX",

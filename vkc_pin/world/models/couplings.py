@@ -20,21 +20,6 @@ from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.robot_schema import CouplingSchema, RobotSchema
 from vkc_pin.world.models.shapes import LIMIT_SLACK
 
-__all__ = [
-    "DEFAULT_JOINT_VELOCITY",
-    "DEFAULT_SLIDE_VELOCITY",
-    "JointCoupling",
-    "add_mimics",
-    "apply_couplings",
-    "apply_robot_limits",
-    "check_followers",
-    "find_coupled_groups",
-    "find_followers",
-    "find_joint_path",
-    "sort_joints",
-    "tighten_coupled_limits",
-]
-
 _MOVING = ("revolute", "continuous", "prismatic")
 DEFAULT_JOINT_VELOCITY = np.pi
 """Velocity limit of revolute joints for which no file states one [rad/s]."""

@@ -19,18 +19,6 @@ from vkc_pin.world.files.xml import make_element_error, read_xml
 from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.shapes import triangulate
 
-__all__ = [
-    "UNLIMITED",
-    "ObjectJointSchema",
-    "Resistance",
-    "TorqueLimits",
-    "compute_mass",
-    "compute_solid_inertia",
-    "compute_torque_limits",
-    "read_resistances",
-    "set_mass",
-]
-
 UNLIMITED = 1e300
 """Effort limits of Pinocchio above this mean that there is no limit."""
 _SAMPLES = 200  # random configurations in which a motor must hold the arm

@@ -12,8 +12,6 @@ from collections.abc import Iterable
 import numpy as np
 import pinocchio as pin
 
-__all__ = ["add_joint", "graft", "graft_geometry", "round_placement"]
-
 
 def round_placement(placement: pin.SE3, tolerance: float = 1e-12) -> pin.SE3:
     """Return `placement` with entries within `tolerance` of 0 and ±1 rounded.

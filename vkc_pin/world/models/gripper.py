@@ -25,18 +25,6 @@ from vkc_pin.world.models.robot_model import build_unlocked_model, find_joint_li
 from vkc_pin.world.models.robot_schema import FingerSchema
 from vkc_pin.world.models.shapes import LIMIT_SLACK
 
-__all__ = [
-    "BAR_THICKNESS",
-    "WIDEST_BAR",
-    "WIDTH_TOLERANCE",
-    "Gripper",
-    "PlacedShape",
-    "build_gripper",
-    "check_bar_fits",
-    "find_thickest_rod",
-    "find_widest_bar",
-]
-
 BAR_THICKNESS = 2e-3
 """Thickness of the bar across the measured direction [m]."""
 WIDTH_TOLERANCE = 1e-4

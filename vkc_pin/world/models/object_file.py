@@ -40,16 +40,6 @@ from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.models.dynamics import ObjectJointSchema, read_resistances, set_mass
 from vkc_pin.world.models.grafting import round_placement
 
-__all__ = [
-    "AttachmentSchema",
-    "FreedomSchema",
-    "LatchSchema",
-    "ObjectSchema",
-    "build_object",
-    "load_object",
-]
-
-
 _contains_zero = require(
     lambda value: value[0] <= 0.0 <= value[1],
     "the limits do not contain 0",

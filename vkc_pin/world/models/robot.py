@@ -31,8 +31,6 @@ from vkc_pin.world.models.shapes import (
     triangulate,
 )
 
-__all__ = ["Base", "Robot"]
-
 _MIN_LEVER = 0.1  # [m/rad] about the size of a hand
 _FRONT_DISTANCE = 10.0  # [m] larger than any hand
 _LEVER_SAMPLES = 200  # random configurations over which the lever is averaged

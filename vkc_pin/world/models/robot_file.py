@@ -47,8 +47,6 @@ from vkc_pin.world.models.self_collisions import apply_self_collision_analysis, 
 from vkc_pin.world.models.shapes import LIMIT_SLACK
 from vkc_pin.world.models.wheels import describe_misplaced_axle, find_drive, is_on_axle
 
-__all__ = ["find_robot", "find_robot_files", "list_robots", "load_robot"]
-
 _BASES = get_args(Base)
 _PAIRS = ("srdf", "sampled", "all")
 _SAMPLES = 1000  # configurations sampled for allowed pairs when a robot is loaded

@@ -22,20 +22,6 @@ from vkc_pin.world.models.couplings import (
 )
 from vkc_pin.world.models.grafting import add_joint, round_placement
 
-__all__ = [
-    "build_full_model",
-    "build_planned_model",
-    "build_unlocked_model",
-    "compute_rest_positions",
-    "find_base_joints",
-    "find_default_tool_frame",
-    "find_joint_limits",
-    "find_nearest_position",
-    "find_neighbours",
-    "load_collision_geometry",
-    "load_visual_geometry",
-]
-
 BASE_JOINT = "base"  # name of the planar joint
 # [m] and entries of rotations: URDFs often have quarter turns with nine digits; exact ones make
 # expressions sparse

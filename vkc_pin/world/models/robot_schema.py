@@ -21,19 +21,6 @@ from vkc_pin.world.files.fields import (
     wrap_text,
 )
 
-__all__ = [
-    "BaseSchema",
-    "CouplingSchema",
-    "FingerSchema",
-    "RobotJointSchema",
-    "RobotSchema",
-    "Wheels",
-    "find_python_packages",
-    "read_robot",
-    "read_wheels",
-]
-
-
 Limits = Annotated[
     tuple[Number, Number],
     require(

@@ -28,15 +28,6 @@ from vkc_pin.world.models.shapes import LinkDistances, ShapeDistances
 Pair = tuple[str, str]
 Parts = list[tuple[int, int]]
 
-__all__ = [
-    "HOME_DISTANCE",
-    "SelfCollisionAnalysis",
-    "analyze_self_collisions",
-    "apply_self_collision_analysis",
-    "sample_allowed_pairs",
-    "set_collision_pairs",
-    "write_srdf",
-]
 
 _VERSION = 1  # of the cached results: increase it whenever the same robot would get other pairs
 _SAMPLES = 20_000

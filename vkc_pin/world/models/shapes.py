@@ -17,24 +17,6 @@ from vkc_pin.world.collision.solids import convert_solid, flatten_placements
 from vkc_pin.world.files.meshes import get_triangles
 from vkc_pin.world.models.grafting import round_placement
 
-__all__ = [
-    "LIMIT_SLACK",
-    "START_SLACK",
-    "LinkDistances",
-    "ShapeDistances",
-    "check_start_value",
-    "clamp_to_limits",
-    "compute_bounding_box",
-    "compute_clearance",
-    "compute_shape_distance",
-    "compute_world_box",
-    "copy_shape",
-    "get_link_name",
-    "get_local_name",
-    "list_placed_shapes",
-    "triangulate",
-]
-
 LIMIT_SLACK = 1e-6
 """Joint values that exceed their limits by at most this are clamped [rad] or [m]."""
 START_SLACK = 1e-2

@@ -13,8 +13,6 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.words import list_words, split_words
 from vkc_pin.world.files.urdf import UrdfFile
 
-__all__ = ["Drive", "describe_misplaced_axle", "find_drive", "has_wheel_name", "is_on_axle"]
-
 _WHEEL_WORDS = list_words("wheel whl tyre tire")
 _CASTER_WORDS = list_words("caster castor")
 _SIDEWAYS_WORDS = list_words("mecanum omni omnidirectional swerve")

@@ -39,22 +39,6 @@ from vkc_pin.world.scene.placed_object import (
     sweep_link_shapes,
 )
 
-__all__ = [
-    "ACCEPTED_SHORTFALL",
-    "CONTACT_DEPTH",
-    "MODEL_ERROR",
-    "ClearanceExemption",
-    "ClosePair",
-    "NearStretch",
-    "PlacedShapes",
-    "find_clearance_exemptions",
-    "find_close_pairs",
-    "get_cached",
-    "make_shape_keys",
-    "make_state_key",
-    "warn_of_overlaps",
-]
-
 CONTACT_DEPTH = 1e-4
 """Largest overlap that counts as contact [m]: resting objects overlap their support by rounding."""
 ACCEPTED_SHORTFALL = 1e-3

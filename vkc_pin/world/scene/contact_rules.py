@@ -45,20 +45,6 @@ from vkc_pin.world.scene.hold import Hold, get_attachment
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 from vkc_pin.world.scene.scene import Scene
 
-__all__ = [
-    "CONTACT_DEPTH",
-    "CONTACT_WINDOW",
-    "compute_grasp_opening",
-    "compute_hand_clearance",
-    "compute_hand_frame",
-    "compute_start_opening",
-    "find_grasp_distances",
-    "find_grasped_link",
-    "find_gripper_hold",
-    "find_touch_links",
-    "is_rigid_grasp",
-]
-
 PlacedShape = tuple[coal.CollisionGeometry, pin.SE3]
 
 CONTACT_WINDOW = 1.0

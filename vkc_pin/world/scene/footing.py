@@ -15,8 +15,6 @@ from vkc_pin.world.models.shapes import compute_world_box, triangulate
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 from vkc_pin.world.scene.support import RESTING_DISTANCE, find_supporting_pairs
 
-__all__ = ["Footing", "find_footing"]
-
 LabelledShape = tuple[str, pin.GeometryObject]
 """Label of a link or obstacle, and one of its shapes with its placement in the world frame."""
 

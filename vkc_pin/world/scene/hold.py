@@ -28,29 +28,6 @@ from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.shapes import clamp_to_limits, compute_clearance, list_placed_shapes
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 
-__all__ = [
-    "MAX_ANGLE_DEVIATION",
-    "MAX_POSITION_DEVIATION",
-    "Hold",
-    "Holds",
-    "Solids",
-    "apply_deviation",
-    "check_deviation",
-    "check_hold_order",
-    "compute_distances",
-    "compute_tool_placement",
-    "find_reversed_approaches",
-    "fit_grasp",
-    "get_attachment",
-    "is_within_grasp",
-    "make_holds",
-    "measure_deviation",
-    "measure_grasp",
-    "place_held_objects",
-    "resolve_holds",
-    "warn_of_openings",
-]
-
 MAX_POSITION_DEVIATION = 0.02
 """Largest distance of a hand from the attachment that it holds [m], measured or in physics."""
 MAX_ANGLE_DEVIATION = 0.2

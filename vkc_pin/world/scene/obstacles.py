@@ -14,7 +14,6 @@ from vkc_pin.world.models.shapes import copy_shape
 if TYPE_CHECKING:
     from vkc_pin.world.scene import scene_schema as schema
 
-__all__ = ["FLOOR", "make_floor_shape", "make_obstacle_shapes"]
 
 FLOOR = "floor"
 """Name of the floor among a scene's obstacles."""

@@ -22,8 +22,6 @@ from vkc_pin.world.models.shapes import (
     get_link_name,
 )
 
-__all__ = ["PlacedObject", "find_link_shapes", "make_world_shapes", "sweep_link_shapes"]
-
 # Half a turn about the line along which the fingers close.
 _OTHER_SIDE = pin.SE3(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
 

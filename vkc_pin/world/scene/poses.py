@@ -11,8 +11,6 @@ from vkc_pin.errors import InputError, format_value
 from vkc_pin.utils.arguments import check_array
 from vkc_pin.utils.arrays import MAX_COORDINATE
 
-__all__ = ["as_placement", "as_target"]
-
 _POSE = "a pinocchio.SE3, a 4 x 4 matrix, (x, y, z, roll, pitch, yaw) or (x, y, z, qx, qy, qz, qw)"
 _NORM_TOLERANCE = 1e-3  # of a unit quaternion
 

@@ -52,7 +52,6 @@ if TYPE_CHECKING:
     from vkc_pin.world.models.robot import Base, Robot
     from vkc_pin.world.scene.scene_schema import RegionSchema, SceneSchema
 
-__all__ = ["START_CLEARANCE", "Scene", "load_scene"]
 
 START_CLEARANCE = 0.03
 """Minimum distance of a random start from all shapes but the floor [m]."""

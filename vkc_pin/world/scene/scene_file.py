@@ -37,8 +37,6 @@ from vkc_pin.world.scene.hold import (
 from vkc_pin.world.scene.obstacles import FLOOR, make_floor_shape, make_obstacle_shapes
 from vkc_pin.world.scene.placed_object import PlacedObject
 
-__all__ = ["make_document", "make_scene_fields"]
-
 
 def make_scene_fields(document: Document, folder: Path) -> dict[str, Any]:
     """Return the attributes of the `Scene` that `document` describes, by name."""

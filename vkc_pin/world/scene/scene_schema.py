@@ -24,24 +24,6 @@ from vkc_pin.world.files.fields import (
 )
 from vkc_pin.world.models.robot import Base
 
-__all__ = [
-    "COLOURS",
-    "AllowSchema",
-    "BoxSchema",
-    "CapsuleSchema",
-    "CylinderSchema",
-    "HeldSchema",
-    "MeshSchema",
-    "ObstacleSchema",
-    "PlacedObjectSchema",
-    "RegionSchema",
-    "SceneRobotSchema",
-    "SceneSchema",
-    "SphereSchema",
-    "StartSchema",
-    "UrdfSchema",
-]
-
 _MAX_OBSTACLES = 10_000  # which take some seconds to load
 
 COLOURS: dict[str, tuple[float, float, float]] = {

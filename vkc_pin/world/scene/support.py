@@ -12,15 +12,6 @@ from vkc_pin.world.models.shapes import compute_shape_distance, compute_world_bo
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 
-__all__ = [
-    "MAX_TILT",
-    "SupportedObject",
-    "compute_tilt",
-    "find_supported_objects",
-    "find_supporting_pairs",
-    "find_supports",
-]
-
 RESTING_DISTANCE = 5e-3
 """Displacement of the support test [m].
 

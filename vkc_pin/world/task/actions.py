@@ -16,14 +16,6 @@ from vkc_pin.world.task.compiler import compile_task, make_nothing_to_do_error
 from vkc_pin.world.task.phases import Task
 from vkc_pin.world.task.steps import Actuate, Grasp, Place, Release, Step, Touch, as_steps
 
-__all__ = [
-    "compile_each_step",
-    "generate_alternatives",
-    "generate_regrasps",
-    "get_grasped_object",
-    "group_into_actions",
-]
-
 
 def group_into_actions(steps: Sequence[Step]) -> list[tuple[Step, ...]]:
     """Return steps grouped into actions that belong together.

@@ -24,18 +24,6 @@ from vkc_pin.world.task.lookup import (
     find_path_joints,
 )
 
-__all__ = [
-    "check_actuation",
-    "compute_advance",
-    "find_blocking_latches",
-    "find_closing_latches",
-    "find_driven_coordinates",
-    "find_driving_attachments",
-    "find_push_directions",
-    "find_shared_coordinate",
-    "list_driving_attachments",
-]
-
 # Samples of a revolute freedom about a distant axis; of a slide, the ends suffice.
 _SAMPLES = 9
 _MIN_ADVANCE = 1e-3  # [m/rad] or 1: below this, a push does not move the joint

@@ -55,8 +55,6 @@ from vkc_pin.world.task.steps import (
 )
 from vkc_pin.world.task.supported_objects import SupportTracker
 
-__all__ = ["compile_task", "make_nothing_to_do_error"]
-
 LATCH_MARGIN = 0.02  # [rad] or [m] past the threshold at which a latch is released
 LATCH_GAP = 1e-3  # [rad] or [m] outside the range of a latch, where a joint is still free
 

@@ -13,8 +13,6 @@ from vkc_pin.world.models.shapes import LIMIT_SLACK
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Configure, Reach
 
-__all__ = ["check_pose_is_unambiguous", "find_configuration"]
-
 _ROUNDING = 1e-4
 """Excess of a goal over a limit that is cut off [rad] or [m].
 

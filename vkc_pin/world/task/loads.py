@@ -21,8 +21,6 @@ from vkc_pin.world.scene.support import RESTING_DISTANCE
 from vkc_pin.world.task.phases import Phase, Task
 from vkc_pin.world.task.supported_objects import place_objects
 
-__all__ = ["check_footings", "check_loads"]
-
 _HEADINGS = 16  # of an object whose heading at the goal is free
 _SAME_PLACE = 1e-3  # [m] and [rad] within which an object is put back where it was
 

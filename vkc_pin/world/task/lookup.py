@@ -18,18 +18,6 @@ from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Phase
 
-__all__ = [
-    "check_graspable",
-    "check_link",
-    "compute_openings",
-    "find_attachment",
-    "find_joint_limits",
-    "find_object",
-    "find_path_joints",
-    "find_robot_frame",
-    "list_graspable_attachments",
-]
-
 
 def find_object(scene: Scene, name: str, where: str) -> PlacedObject:
     """Return an object of a scene."""

@@ -13,17 +13,6 @@ from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.support import SupportedObject
 from vkc_pin.world.task.steps import Step
 
-__all__ = [
-    "FrameGoal",
-    "OpenAttachment",
-    "Phase",
-    "PhaseKey",
-    "PhaseKind",
-    "StepBoundary",
-    "Task",
-    "summarize_phases",
-]
-
 PhaseKind = Literal["grasp", "reach", "touch", "place", "turn", "move", "go", "configure", "stand"]
 PhaseKey = tuple[PhaseKind, tuple[str, ...]]
 _VERBS: Mapping[PhaseKind, str] = {

@@ -21,23 +21,6 @@ from vkc_pin.utils.arguments import (
 )
 from vkc_pin.world.scene.poses import as_placement, as_target
 
-__all__ = [
-    "STEPS",
-    "Actuate",
-    "Configure",
-    "GoTo",
-    "Grasp",
-    "Place",
-    "Reach",
-    "Release",
-    "Step",
-    "Touch",
-    "as_steps",
-    "describe_step",
-    "step_from_dict",
-    "step_to_dict",
-]
-
 
 def _check_names(step: Any, **optional: bool) -> None:
     """Check that fields of a step are strings, or None where that is allowed."""

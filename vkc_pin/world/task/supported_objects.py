@@ -20,14 +20,6 @@ from vkc_pin.world.scene.support import (
     find_supports,
 )
 
-__all__ = [
-    "SupportTracker",
-    "compute_placement_after_motion",
-    "find_objects_supported_by",
-    "place_objects",
-]
-
-
 _LEVEL = 1e-3  # [rad] tilt up to which a goal counts as level: the tolerance of goals
 
 

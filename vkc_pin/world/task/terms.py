@@ -29,19 +29,6 @@ from vkc_pin.utils.arrays import Floats
 if TYPE_CHECKING:
     from vkc_pin.world.scene.scene import Scene
 
-__all__ = [
-    "Constraint",
-    "Cost",
-    "Formula",
-    "State",
-    "Term",
-    "check_terms_active",
-    "rename_term",
-    "term_from_dict",
-    "term_to_dict",
-    "trace_terms",
-    "trace_terms_without_scene",
-]
 
 # Added under every square root, whose derivative is infinite at zero (as for a zero velocity).
 ROUNDING = 1e-8

@@ -13,15 +13,6 @@ from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import check_array
 from vkc_pin.utils.arrays import Floats, Ints
 
-__all__ = [
-    "MIN_INTERVAL",
-    "Curve",
-    "concatenate_curves",
-    "divide_intervals",
-    "sample_evenly",
-    "sample_intervals",
-]
-
 MIN_INTERVAL = 1e-9
 """Shortest time between knots [s]."""
 _OFF = 1e-9  # accepted distance of the curve from a waypoint [m] or [rad]

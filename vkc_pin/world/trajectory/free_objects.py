@@ -17,8 +17,6 @@ from vkc_pin.world.scene.support import find_supported_objects
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["FreeObjects", "to_free_joint_positions"]
-
 # [m], [rad] rounding of constant grasp coordinates between samples
 _STILL = 1e-12
 

@@ -10,8 +10,6 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.utils.arguments import check_integer, check_mapping, check_number, check_text
 from vkc_pin.world.scene.hold import Hold, check_hold_order, make_holds
 
-__all__ = ["PhaseSpan", "check_fields", "get_required_field"]
-
 _FIELDS = ("name", "first", "last", "held", "by", "deviation", "opening")
 
 

@@ -14,8 +14,6 @@ from vkc_pin.world.trajectory.curve import divide_intervals
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
-__all__ = ["Motion", "key_times", "sample_motion"]
-
 # Largest step between key frames [rad], [m]; beyond π an interpolated rotation would reverse.
 _TURN = 1.0
 # The same while free objects are carried, which a viewer moves along chords: arcs with a radius of

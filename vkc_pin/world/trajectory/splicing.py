@@ -13,8 +13,6 @@ from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = ["concatenate_trajectories", "extract_phases", "fill_missing_values"]
-
 
 def concatenate_trajectories(parts: Sequence[Trajectory], *, pause: float) -> Trajectory:
     """Concatenate motions, with pauses [s] where holds or the gripper opening change.

@@ -21,8 +21,6 @@ from vkc_pin.world.trajectory.free_objects import FreeObjects
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.wheels import rotate_into_base_frame
 
-__all__ = ["Handle", "Loads", "MotionSamples", "Torques", "sample_curve", "transform_to_base_axes"]
-
 Loads = Sequence[tuple[int, pin.Inertia]]
 """Supported loads: joint of the object's model, and inertia in the frame of that joint."""
 _GRIP = 0.1  # lever arm of a hand, for the weighting of torques [m]

@@ -27,8 +27,6 @@ from vkc_pin.world.trajectory.curve import Curve, sample_evenly
 from vkc_pin.world.trajectory.formats import ros, rosbag, tables
 from vkc_pin.world.trajectory.phase_span import PhaseSpan, check_fields, get_required_field
 
-__all__ = ["Trajectory"]
-
 _FIELDS = ("names", "times", "positions", "robot_size", "phases", "curve")
 MOST_SAMPLES = 1_000_000
 """Largest number of samples of a motion."""

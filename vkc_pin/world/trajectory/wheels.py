@@ -15,8 +15,6 @@ import numpy as np
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.robot import Robot
 
-__all__ = ["OMNIDIRECTIONAL", "RollingLimits", "make_rolling_limits", "rotate_into_base_frame"]
-
 _REST_TOLERANCE = 1e-4  # smaller longitudinal motions have no direction [m]
 
 

@@ -28,14 +28,6 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.free_objects import FreeObjects, to_free_joint_positions
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-__all__ = [
-    "FREE_JOINT",
-    "World",
-    "compute_final_scene",
-    "compute_frame_placement",
-    "find_coordinate_units",
-]
-
 FREE_JOINT = "placement"
 """Name of a free object's free joint: `<object>.placement`."""
 

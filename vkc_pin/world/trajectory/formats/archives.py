@@ -37,18 +37,6 @@ from vkc_pin.world.files.fields import Schema, make_validation_error
 from vkc_pin.world.files.resources import find_resource_folder
 from vkc_pin.world.files.writing import write_atomically
 
-__all__ = [
-    "FORMAT",
-    "METRICS",
-    "MotionSchema",
-    "PlanStatus",
-    "ReportSchema",
-    "read_archive",
-    "resolve_folder",
-    "serialize_folder",
-    "write_archive",
-]
-
 FORMAT = 1
 # Sizes of a file and of an unpacked part [bytes]: 200 000 waypoints of 25 coordinates.
 _MAX_ARCHIVE, _MAX_MEMBER = 20_000_000, 40_000_000

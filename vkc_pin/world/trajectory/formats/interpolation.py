@@ -15,8 +15,6 @@ import numpy as np
 from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.world.trajectory.curve import MIN_INTERVAL
 
-__all__ = ["interpolate_points"]
-
 _POSITION_ACCURACY = 1e-6  # [m] or [rad], of cubics in place of a quintic
 _ACCELERATION_ACCURACY = 1e-3  # of the largest acceleration: validation accepts as much
 _MOST_PIECES = 100  # of a quintic; enough for these accuracies where it covers less than 20 m

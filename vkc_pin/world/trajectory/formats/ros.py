@@ -30,8 +30,6 @@ from vkc_pin.world.trajectory.formats.tables import (
     select_columns,
 )
 
-__all__ = ["MOST_SECONDS", "from_ros", "sample_states", "to_ros"]
-
 _MAX_VALUES = 1_000_000  # positions in a message: some 300 MB
 _NANO = 1_000_000_000
 _MOST_TIME = 2**32  # [s] and [ns]: ROS has 32 bits for each

@@ -23,8 +23,6 @@ from vkc_pin.utils.optional_imports import import_optional
 from vkc_pin.world.files.writing import write_folder_atomically
 from vkc_pin.world.trajectory.formats.ros import MOST_SECONDS, sample_states, to_ros
 
-__all__ = ["TOPICS", "import_rosbags", "write_rosbag"]
-
 TOPICS: Mapping[str, str] = {
     "arm/joint_trajectory": "trajectory_msgs/msg/JointTrajectory",
     "base/joint_trajectory": "trajectory_msgs/msg/JointTrajectory",

@@ -22,17 +22,6 @@ from vkc_pin.world.files.documents import parse_json, read_text
 from vkc_pin.world.files.resources import check_path
 from vkc_pin.world.files.writing import write_atomically
 
-__all__ = [
-    "GROUPS",
-    "infer_robot_size",
-    "make_single_phase",
-    "read_csv",
-    "read_json",
-    "select_columns",
-    "write_csv",
-    "write_json",
-]
-
 GROUPS = ("all", "robot", "base", "arm", "objects")
 """Groups of coordinates: all, base and arm, base, arm, or joints of objects."""
 _MAX_BYTES = 20_000_000  # of a file: about 30 000 waypoints of 25 coordinates

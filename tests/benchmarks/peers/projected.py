@@ -30,7 +30,7 @@ _NODES = 20_000
 _SHARE = 0.2  # of the time that is left, at most, for one configuration at the goal
 
 
-def plan_by_projection(
+def plan_by_projection(  # noqa: PLR0915 - sets up one planner, step by step
     own: PeerProblem,
     problem: TrajectoryProblem,
     seed: int,

@@ -37,7 +37,9 @@ class Solver:
         self.files: tuple[str, str] = ("", "")
         self.environment: Any = None
 
-    def __call__(self, ask: dict[str, Any]) -> dict[str, Any]:
+    def __call__(  # noqa: PLR0915 - sets up one problem, step by step
+        self, ask: dict[str, Any]
+    ) -> dict[str, Any]:
         """Return waypoints, status and time for one initial guess."""
         import numpy as np
 

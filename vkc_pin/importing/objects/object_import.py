@@ -203,15 +203,7 @@ def import_object(  # noqa: PLR0913 - keyword options of a public call
     check_choice(up, ("y", "z"), "vertical axis", "up")
     if link is not None:
         check_text(link, "link", "the name of a link")
-    for name, value in (("height", height), ("scale", scale)):
-        if value is not None and check_coordinate(value, name) <= 0.0:
-            raise InputError(
-                f"`{name}` must be positive", field=name, expected="a number above 0", got=value
-            )
-    if height is not None and scale is not None:
-        raise InputError(
-            "`height` and `scale` exclude each other", field="height, scale", expected="one of them"
-        )
+    _check_size(height, scale)
     check_integer(most, "most", low=1, high=100)
     options = Options() if options is None else check_instance(options, Options, "options")
     clearances = {"dist_safe": options.dist_safe, "grasp_clearance": options.grasp_clearance}
@@ -274,6 +266,19 @@ def import_object(  # noqa: PLR0913 - keyword options of a public call
         target / picture.name,
         None if scene is None else target / "scene.yaml",
     )
+
+
+def _check_size(height: float | None, scale: float | None) -> None:
+    """Raise InputError unless at most one is given, a positive number."""
+    for name, value in (("height", height), ("scale", scale)):
+        if value is not None and check_coordinate(value, name) <= 0.0:
+            raise InputError(
+                f"`{name}` must be positive", field=name, expected="a number above 0", got=value
+            )
+    if height is not None and scale is not None:
+        raise InputError(
+            "`height` and `scale` exclude each other", field="height, scale", expected="one of them"
+        )
 
 
 def _choose_name(path: Path, link: str | None) -> str:

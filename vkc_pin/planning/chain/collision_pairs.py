@@ -327,20 +327,22 @@ class _PairBuilder:
             _compute_boxes(self._obstacles),
         )
 
-    def build_phase(self, number: int) -> PhaseGeometry:
-        phase, scene, chain = self.task.phases[number], self.scene, self.chain
-        holds = {hold.object: hold for hold in phase.held}
-        shapes = list(chain.get_collision_geometry(phase.opening).geometryObjects)
-        labels = list(self._labels)
-        of_chain = self._compute_boxes[0] if phase.opening is None else _compute_boxes(shapes)
-        robots = range(len(scene.robot.collision.geometryObjects))
-        own = len(shapes)
+    def _pair_moving_shapes(
+        self, phase: Phase, shapes: Sequence[pin.GeometryObject]
+    ) -> tuple[list[tuple[int, int, float]], dict[str, tuple[int, ...]]]:
+        """Return the pairs of the robot and the objects that it moves.
+
+        Returns:
+            Pairs of shapes with their margins [m], and attached or supported object → its shapes.
+        """
+        scene, chain, labels = self.scene, self.chain, self._labels
         margin = self.options.dist_safe
         pairs = [
             (*pair, own_margin)
             for pair, own_margin in scene.robot.own_margins(self.options.self_distance).items()
         ]
-        moving, attached_shapes = list(robots), dict[str, tuple[int, ...]]()
+        attached_shapes: dict[str, tuple[int, ...]] = {}
+        moving = list(range(len(scene.robot.collision.geometryObjects)))
         for hold in phase.held:
             attached_shapes[hold.object] = chain.held_geometries[hold]
             pairs += [
@@ -365,6 +367,19 @@ class _PairBuilder:
                 for j in attached_shapes[ride.object]
             ]
             moving += attached_shapes[ride.object]
+        return pairs, attached_shapes
+
+    def build_phase(self, number: int) -> PhaseGeometry:
+        phase, scene, chain = self.task.phases[number], self.scene, self.chain
+        holds = {hold.object: hold for hold in phase.held}
+        shapes = list(chain.get_collision_geometry(phase.opening).geometryObjects)
+        labels = list(self._labels)
+        of_chain = self._compute_boxes[0] if phase.opening is None else _compute_boxes(shapes)
+        robots = range(len(scene.robot.collision.geometryObjects))
+        own = len(shapes)
+        margin = self.options.dist_safe
+        pairs, attached_shapes = self._pair_moving_shapes(phase, shapes)
+        moving = [*robots, *itertools.chain.from_iterable(attached_shapes.values())]
         pairs = [pair for pair in pairs if np.isfinite(pair[2])]
         left: dict[str, tuple[int, ...]] = {}
         for name, placed in scene.objects.items():
@@ -404,21 +419,16 @@ class _PairBuilder:
                 shapes.append(shape)
                 labels.append(label)
         record_evaluations()
-        attached = {
+        free_shapes = {
             i
             for name, indices in attached_shapes.items()
             if scene.objects[name].object.free
             for i in indices
         }
-        floor_movers = [
-            i for i in moving if i in attached or (i in robots and shapes[i].parentJoint > 1)
-        ]
-        table = np.concatenate(
-            [
-                np.array(pairs).reshape(-1, 3),
-                self._pair_with_obstacles(len(shapes), moving, floor_movers),
-            ]
-        )
+        arm_shapes = {i for i in robots if shapes[i].parentJoint > 1}
+        floor_movers = [i for i in moving if i in free_shapes | arm_shapes]
+        with_obstacles = self._pair_with_obstacles(len(shapes), moving, floor_movers)
+        table = np.concatenate([np.array(pairs).reshape(-1, 3), with_obstacles])
         labels += scene.obstacle_labels
         names = [shape.name for shape in shapes] + [shape.name for shape in self._obstacles]
         table, margin_regions = self._apply_exemptions(

@@ -81,34 +81,14 @@ class Coordinates:
             j = len(names)
             if joint.nv == 0 and index in followers:
                 continue
+            parts, limited, direct = _list_coordinates(joint, name)
             kind = joint.shortname()
-            limited = 0  # number of coordinates with position limits
-            direct = 0  # number of coordinates that are entries of q themselves
             if kind == "JointModelPlanar":
-                parts, limited, direct = {"_x": "m", "_y": "m", "_yaw": "rad"}, 2, 2
                 angles.append((i + 2, j + 2))
             elif kind == "JointModelFreeFlyer":
-                parts = {
-                    "_x": "m",
-                    "_y": "m",
-                    "_z": "m",
-                    "_qx": "1",
-                    "_qy": "1",
-                    "_qz": "1",
-                    "_qw": "1",
-                }
-                direct = 3
                 quaternions.append((i + 3, j + 3))
             elif kind in _UNBOUNDED:
-                parts = {"": "rad"}
                 angles.append((i, j))
-            elif joint.nq == 1 and joint.nv == 1:
-                parts, limited, direct = {"": "m" if kind in _SLIDING else "rad"}, 1, 1
-            else:
-                expected = "a planar joint or one of 1 degree of freedom"
-                raise InputError(
-                    "this joint type is not supported", field=name, expected=expected, got=kind
-                )
             plain += [(i + k, j + k) for k in range(direct)]
             names += [name + part for part in parts]
             units += parts.values()
@@ -254,6 +234,31 @@ class Coordinates:
     def index(self, name: str) -> int:
         """Return the index of coordinate `name` in z."""
         return self.names.index(check_choice(name, self.names, "coordinate"))
+
+
+def _list_coordinates(joint: pin.JointModel, name: str) -> tuple[dict[str, str], int, int]:
+    """Return the coordinates of a joint.
+
+    Returns:
+        Suffix of the name → unit of each coordinate, how many of the first have position limits,
+        and how many of the first are entries of q themselves.
+
+    Raises:
+        InputError: There are no coordinates for joints of this type.
+    """
+    kind = joint.shortname()
+    if kind == "JointModelPlanar":
+        return {"_x": "m", "_y": "m", "_yaw": "rad"}, 2, 2
+    if kind == "JointModelFreeFlyer":
+        positions = {"_x": "m", "_y": "m", "_z": "m"}
+        quaternion = {"_qx": "1", "_qy": "1", "_qz": "1", "_qw": "1"}
+        return {**positions, **quaternion}, 0, 3
+    if kind in _UNBOUNDED:
+        return {"": "rad"}, 0, 0
+    if joint.nq == 1 and joint.nv == 1:
+        return {"": "m" if kind in _SLIDING else "rad"}, 1, 1
+    expected = "a planar joint or one of 1 degree of freedom"
+    raise InputError("this joint type is not supported", field=name, expected=expected, got=kind)
 
 
 def wrap_angle(angle: Any) -> Any:

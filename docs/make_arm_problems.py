@@ -23,6 +23,8 @@ from vkc_pin.importing.moveit_problems import list_problems, read_problem
 from vkc_pin.planning.initialization.keyframes import find_free_configurations
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Bools, Floats
+from vkc_pin.world.models.shapes import compute_world_box
+from vkc_pin.world.scene.hold import compute_tool_placement
 from vkc_pin.world.task.compiler import compile_task
 
 _OPTIONS = vkc.Options(dist_safe=0.005, self_distance=0.005)
@@ -78,20 +80,11 @@ def find_problem(scene: vkc.Scene, rng: np.random.Generator) -> tuple[Floats, Fl
 
 def is_among_obstacles(scene: vkc.Scene, z: Floats) -> Bools:
     """Return for each configuration, shape (B, n), whether the tool is in their bounding box."""
-    model, data = scene.robot.model, scene.robot.model.createData()
-    tool = model.getFrameId(scene.robot.tool_frame)
-    points = np.empty((len(z), 3))
-    for point, q in zip(points, scene.robot.coordinates.q(z), strict=True):
-        pin.framesForwardKinematics(model, data, q)
-        point[:] = data.oMf[tool].translation
-    corners = []
-    for shape in scene.obstacles:
-        shape.geometry.computeLocalAABB()
-        box = shape.geometry.aabb_local
-        local = np.array(np.meshgrid(*zip(box.min_, box.max_, strict=True))).reshape(3, -1)
-        corners.append(shape.placement.rotation @ local + shape.placement.translation[:, None])
-    every = np.hstack(corners)
-    inside = (points >= every.min(axis=1)) & (points <= every.max(axis=1))
+    points = np.array([compute_tool_placement(scene.robot, row).translation for row in z])
+    boxes = [compute_world_box(shape.geometry, shape.placement) for shape in scene.obstacles]
+    low = np.min([box[0] for box in boxes], axis=0)
+    high = np.max([box[1] for box in boxes], axis=0)
+    inside = (points >= low) & (points <= high)
     return np.asarray(inside.all(axis=1))
 
 

@@ -1,7 +1,8 @@
 """Draws docs/images/tradeoff.png from its record: `python docs/make_tradeoff.py`.
 
-docs/results/tradeoff.json.gz is that of `vkc-pin bench ablation` with other weights of the base. A
-point is the mean path lengths of base and arm over the problems that succeed at every weight.
+docs/results/tradeoff.json.gz is that of `python -m tests.benchmarks ablation` with other weights of
+the base. A point is the mean path lengths of base and arm over the problems that succeed at every
+weight.
 """
 
 from __future__ import annotations

@@ -27,8 +27,6 @@ from .peers.found import Clock
 from .peers.run import PEERS, find_versions, plan_by_peer
 from .peers.tasks import PeerProblem, build_program
 
-__all__ = ["BASES", "GOALS", "METHODS", "format_results", "run"]
-
 METHODS = ("VKC", "roboplan", "OMPL")
 BASES = ("fixed", "omni")
 GOALS = ("joints", "pose")

@@ -18,8 +18,6 @@ from vkc_pin.planning.planner import plan
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate
 
-__all__ = ["BASES", "TASKS", "TURNING_RADIUS", "format_results", "make_start", "run"]
-
 TASKS = {"door": {"hinge": 1.2}, "drawer": {"slide": 0.35}}
 """Scene → goal of the object of the same name."""
 TURNING_RADIUS = 0.8

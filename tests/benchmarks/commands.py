@@ -44,8 +44,7 @@ def _add_peers(benches: Any) -> None:
     add_count(parser, "--trials", 20, "problems per task")
     add_choice(parser, "tasks", "reach door drawer (default: all)")
     add_choice(parser, "methods", "trajopt OMPL roboplan HPP B1 B2 VKC (default: all)")
-    about = "wall-clock limit of a trial (default 60)"
-    parser.add_argument("--time-limit", type=float, default=60.0, metavar="SECONDS", help=about)
+    _add_time_limit(parser)
 
 
 def _add_scenes(benches: Any) -> None:
@@ -88,8 +87,7 @@ def _add_arms(benches: Any) -> None:
     add_choice(parser, "bases", "fixed omni (default: fixed)")
     add_choice(parser, "goals", "joints pose (default: joints)")
     add_count(parser, "--every", 1, "only every so many problems", metavar="K")
-    about = "wall-clock limit of a trial (default 60)"
-    parser.add_argument("--time-limit", type=float, default=60.0, metavar="SECONDS", help=about)
+    _add_time_limit(parser)
 
 
 def _add_matrix(benches: Any) -> None:
@@ -142,6 +140,11 @@ def _add_problems(benches: Any) -> None:
     about = "plan impossible problems with known reasons"
     parser = _add_benchmark(benches, "impossible", about, "problems.impossible")
     add_count(parser, "--problems", 50, "problems")
+
+
+def _add_time_limit(parser: argparse.ArgumentParser) -> None:
+    about = "wall-clock limit of a trial (default 60)"
+    parser.add_argument("--time-limit", type=float, default=60.0, metavar="SECONDS", help=about)
 
 
 def _add_benchmark(

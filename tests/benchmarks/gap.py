@@ -18,8 +18,6 @@ from .problems.ablation import SUMMARIZED, SUMMARY, summary, tabulate_trials
 from .problems.poses import sample_random_start
 from .problems.trials import run_trial
 
-__all__ = ["POSE", "SCENE", "format_results", "make_start", "run"]
-
 SCENE = "gap_table"
 POSE = (2.5, 0.5, 0.95, np.pi, 0.0, 0.0)
 """Tool pose (x, y, z, roll, pitch, yaw) [m, rad] in the world frame, 0.2 m above the table."""

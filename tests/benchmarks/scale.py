@@ -36,17 +36,6 @@ from vkc_pin.world.task.steps import Actuate
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = [
-    "AXES",
-    "Axis",
-    "format_results",
-    "make_crowded_scene",
-    "make_refined_options",
-    "run",
-    "scale_chart",
-    "specify",
-]
-
 
 @dataclass(frozen=True)
 class Axis:

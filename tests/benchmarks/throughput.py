@@ -31,17 +31,6 @@ from vkc_pin.world.files.writing import write_atomically
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = [
-    "RECIPE",
-    "WORKERS",
-    "Costs",
-    "format_results",
-    "measure_costs",
-    "record",
-    "run",
-    "simulate_workers",
-    "workers_chart",
-]
 
 WORKERS = (1, 2, 10, 100, 1000)
 _AHEAD = 2  # tasks in hand or waiting at a worker, as the engine has them

@@ -49,13 +49,13 @@ def _add_comparisons(benches: Any) -> None:
     add_choice(parser, "scenes", "init_1 init_2 init_3 (default: all)")
     add_choice(parser, "methods", "stationary interpolated astar rrt auto (default: all)")
 
+    household = "cup door drawer dishwasher refrigerator cabinet"
     tasks = {
-        "baselines": (50, "at a door and a drawer", "door drawer"),
-        "household": (20, "in a home", "cup door drawer dishwasher refrigerator cabinet"),
+        "baselines": ("door_and_drawer", 50, "at a door and a drawer", "door drawer"),
+        "household": ("household", 20, "in a home", household),
     }
-    modules = {"baselines": "door_and_drawer", "household": "household"}
-    for name, (trials, where, names) in tasks.items():
-        module = f"vkc_pin.experiments.{modules[name]}"
+    for name, (file, trials, where, names) in tasks.items():
+        module = f"vkc_pin.experiments.{file}"
         about = f"compare simultaneous with separate planning of base and arm, {where}"
         parser = add_experiment(benches, name, about, module=module, jobs=jobs)
         add_count(parser, "--trials", trials, "random starts per task")
@@ -112,7 +112,7 @@ def add_experiment(
     Args:
         benches: The subparsers.
         name: Name of the command.
-        about: What it does, the beginning of a sentence.
+        about: Beginning of a sentence about it, for the help.
         module: Module with a function `run` that takes the options.
         jobs: Default number of processes.
         seeded: Whether it takes a random seed.

@@ -24,8 +24,6 @@ from .processes import start_solver
 from .sampled import compute_finite_limits
 from .tasks import PeerProblem, find_exact_start, sample_goals
 
-__all__ = ["plan_by_constraint_graph"]
-
 _ENDS = 20  # configurations at the goal
 _SHARE = 0.3  # of the time that is left, for one of them
 _SETTINGS = {

@@ -23,8 +23,6 @@ from vkc_pin.world.files.hulls import compute_hull
 
 from .sampled import compute_finite_limits
 
-__all__ = ["FRAME", "GROUP", "Description", "describe"]
-
 GROUP, FRAME = "chain", "goal_frame"
 _AXES = {"X": (1.0, 0.0, 0.0), "Y": (0.0, 1.0, 0.0), "Z": (0.0, 0.0, 1.0)}
 _AROUND = 1.06  # radius of the corners of 42 that lie around a unit sphere

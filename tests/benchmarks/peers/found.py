@@ -20,8 +20,6 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 
 from .tasks import PeerProblem
 
-__all__ = ["Clock", "Peer", "PeerResult", "compute_clearances", "validate_path"]
-
 _BETWEEN = 10  # moments that are looked at between two waypoints
 _NEAR = 0.1  # [m] up to which distances are measured
 

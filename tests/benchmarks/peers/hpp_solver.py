@@ -13,8 +13,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Solver"]
-
 _ITERATIONS = 1_000_000  # of a search, which ends by its time
 _PROJECTION = 40  # iterations
 

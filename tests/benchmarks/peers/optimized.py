@@ -22,8 +22,6 @@ from .processes import start_solver
 from .sampled import compute_finite_limits
 from .tasks import PeerProblem, sample_goals
 
-__all__ = ["plan_by_trajopt"]
-
 _ENDS = 10  # seeds at most
 _SHARE = 0.3  # of the time that is left, for one of them
 _MARGIN = 0.002  # [m] added to margins, since constraints hold to a tolerance

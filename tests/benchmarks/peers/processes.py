@@ -13,8 +13,6 @@ from typing import Any
 
 from vkc_pin.errors import InputError
 
-__all__ = ["start_solver"]
-
 
 @cache
 def start_solver(

@@ -22,8 +22,6 @@ from .found import Clock, PeerResult
 from .sampled import subdivide
 from .tasks import PeerProblem, find_exact_start, sample_goals
 
-__all__ = ["plan_by_projection"]
-
 _ENDS = 20  # configurations at the goal
 _STEP = 0.05  # [m] and [rad] between configurations that are looked at
 _NODES = 20_000
@@ -38,8 +36,8 @@ def plan_by_projection(  # noqa: PLR0915 - sets up one planner, step by step
     accept: Callable[[Floats], bool],
 ) -> PeerResult:
     """Plan with roboplan; see `found.Peer`."""
-    core = import_optional("roboplan.core", "peers", purpose="bench peers")
-    rrt = import_optional("roboplan.rrt", "peers", purpose="bench peers")
+    core = import_optional("roboplan.core", "peers", purpose="comparing planners")
+    rrt = import_optional("roboplan.rrt", "peers", purpose="comparing planners")
     goals = sample_goals(problem, np.random.default_rng([seed, 1]), _ENDS)
     if not len(goals):
         return PeerResult(status="no configuration at the goal")

@@ -41,16 +41,6 @@ from .projected import plan_by_projection
 from .sampled import plan_by_sampling
 from .tasks import TASKS, PeerProblem, build_program, make_problem
 
-__all__ = [
-    "METHODS",
-    "PEERS",
-    "TIME_LIMIT",
-    "find_versions",
-    "format_results",
-    "plan_by_peer",
-    "run",
-]
-
 PEERS: Mapping[str, tuple[Peer, str, str]] = {
     "trajopt": (plan_by_trajopt, "tesseract_robotics", "tesseract-robotics-nanobind"),
     "OMPL": (plan_by_sampling, "ompl", "ompl"),
@@ -168,7 +158,7 @@ def find_versions(methods: Sequence[str]) -> dict[str, str]:
         try:
             found[package] = version(package)
         except PackageNotFoundError:
-            import_optional(module, "peers", purpose="bench peers")
+            import_optional(module, "peers", purpose="comparing planners")
             raise
     return found
 

@@ -21,8 +21,6 @@ from vkc_pin.utils.optional_imports import import_optional
 from .found import Clock, PeerResult
 from .tasks import PeerProblem, find_exact_start, sample_goals
 
-__all__ = ["compute_finite_limits", "plan_by_sampling", "subdivide"]
-
 _ENDS = 20  # configurations at the goal
 _STEP = 0.05  # [rad] between configurations that are looked at
 _RANGE = 1.0  # [rad] that a tree grows at most at a time
@@ -49,7 +47,7 @@ def plan_by_sampling(  # noqa: C901, PLR0915 - sets up one planner, step by step
 ) -> PeerResult:
     """Plan with OMPL; see `found.Peer`."""
     ob, og, ou = (
-        import_optional(f"ompl.{part}", "peers", purpose="bench peers")
+        import_optional(f"ompl.{part}", "peers", purpose="comparing planners")
         for part in ("base", "geometric", "util")
     )
     ou.setLogLevel(ou.LogLevel.LOG_NONE)

@@ -26,15 +26,6 @@ from ..problems.poses import (
     sample_random_start,
 )
 
-__all__ = [
-    "TASKS",
-    "PeerProblem",
-    "build_program",
-    "find_exact_start",
-    "make_problem",
-    "sample_goals",
-]
-
 TASKS: Mapping[str, str] = {
     "reach": "bring the tool to a pose, base and arm, in a random room",
     "door": "push a door by 1.2 rad whose lever is held",

@@ -8,8 +8,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-__all__ = ["Solver"]
-
 
 class Solver:
     """Solves requests; keeps the environment of the last files."""

@@ -11,8 +11,6 @@ import json
 import sys
 import time
 
-__all__ = ["main"]
-
 
 def main(name: str) -> int:
     """Answer requests to the solver in the module `name` until the input ends."""

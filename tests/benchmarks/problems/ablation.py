@@ -37,16 +37,6 @@ from .problem_set import (
     problem,
 )
 
-__all__ = [
-    "SUMMARIZED",
-    "SUMMARY",
-    "format_results",
-    "run",
-    "specify",
-    "summary",
-    "tabulate_trials",
-]
-
 PAIRED = {
     "planning_time": "time",
     "cpu_time": "CPU",

@@ -16,8 +16,6 @@ from typing import Any
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.options import Options
 
-__all__ = ["UNCHANGED", "Change", "parse_change"]
-
 _FORM = "Options.field=value, or module:NAME=value such as solver.loop:PROGRESS=0.6"
 _PACKAGE = "vkc_pin.planning"  # whose modules have the constants
 

@@ -25,8 +25,6 @@ from .ablation import tabulate_trials
 from .problem_set import make_task_problem
 from .trials import run_trial
 
-__all__ = ["format_results", "run"]
-
 
 def run(
     *,

@@ -21,8 +21,6 @@ from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Step
 
 from .ablation import tabulate_trials
 
-__all__ = ["KINDS", "format_results", "run", "sample_impossible_problem"]
-
 _WIDTH = 0.67  # [m] of the robot's base
 _HALL = 6.0  # [m] from the middle of the hall to its edges
 

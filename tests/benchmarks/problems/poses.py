@@ -14,8 +14,6 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.shapes import compute_shape_distance, compute_world_box
 from vkc_pin.world.scene.scene import Scene
 
-__all__ = ["sample_pose_among", "sample_pose_over", "sample_random_start"]
-
 CLEAR = 0.03  # [m] from everything, the robot itself too
 NEAR = 0.15  # [m] from something, at most, for a pose among furniture
 FAR = 1.5  # [m] from the start to where the robot stands, at least, for the same

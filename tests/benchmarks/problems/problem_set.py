@@ -19,15 +19,6 @@ from vkc_pin.world.task.steps import Actuate, Place, Reach, Step
 
 from .poses import sample_pose_among, sample_pose_over
 
-__all__ = [
-    "KINDS",
-    "NUMBER",
-    "Problem",
-    "get_kind",
-    "make_task_problem",
-    "problem",
-]
-
 KINDS = ("reach", "door", "pull", "carry", "scene")
 """Kinds of problems: ten of each of the first four in random rooms, then twenty in scenes."""
 NUMBER = 60

@@ -43,8 +43,6 @@ from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Step, T
 from .ablation import tabulate_trials
 from .problem_set import Problem
 
-__all__ = ["format_results", "run", "sample_problem"]
-
 _TRIES = 50  # rooms or obstacles in which something finds no place
 _OBSTACLES = 6  # at most
 _SECOND = 0.3  # share of problems of two steps

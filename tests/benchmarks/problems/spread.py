@@ -25,8 +25,6 @@ from . import trials
 from .ablation import select_problems, tabulate_trials
 from .problem_set import problem
 
-__all__ = ["compute_spread", "format_results", "run"]
-
 FIELDS = {
     "objective": "objective",
     "base_path_length": "base path length",

@@ -20,8 +20,6 @@ from vkc_pin.world.task.steps import Reach, Step
 
 from .changes import UNCHANGED, Change
 
-__all__ = ["compute_objective", "is_first_guess_success", "run_trial"]
-
 
 def run_trial(
     scene: Scene, steps: tuple[Step, ...], *, seed: int, change: Change = UNCHANGED, **more: Any

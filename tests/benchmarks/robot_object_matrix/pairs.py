@@ -37,22 +37,6 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Actuate
 
-__all__ = [
-    "DEFAULT",
-    "OBJECTS",
-    "ROBOTS",
-    "SHARE",
-    "Pair",
-    "Request",
-    "get_kind",
-    "load_description",
-    "make_hall",
-    "make_pair",
-    "parse_requests",
-    "prepare_object",
-    "prepare_robot",
-]
-
 ROBOTS = (
     "husky_ur5e",
     "panda",

@@ -37,8 +37,6 @@ from vkc_pin.world.models.self_collisions import set_collision_pairs
 from vkc_pin.world.scene.scene import load_scene
 from vkc_pin.world.task.steps import Reach
 
-__all__ = ["ROBOTS", "format_results", "run", "sample_reachable_poses"]
-
 _AWAY = 1.0  # [m] from the start, along x and along y, that the base drives at most
 # configurations for each pose: some of an arm folded tightly are free in one of a hundred
 _TRIES = 20_000

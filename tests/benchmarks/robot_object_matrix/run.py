@@ -39,7 +39,6 @@ from .pairs import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["chart", "format_results", "run"]
 
 _SUMMARY = (
     "robot",

@@ -268,7 +268,7 @@ def _load_hull(
     """Return the hull of a version of a mesh file; None if it is flat, since each use warns.
 
     Corners and triangles are cached on disk: neither trimesh nor SciPy is imported for a hull that
-    is there. Files of the format glTF are read again, because their buffers may be other files.
+    is cached. glTF files are read again, because their buffers may be in other files.
     """
 
     def build() -> tuple[list[list[float]], list[list[int]]] | None:

@@ -77,7 +77,7 @@ class Coordinates:
         for index in range(1, model.njoints):
             joint = model.joints[index]
             name = model.names[index]
-            i = model.joints[index].idx_q
+            i = joint.idx_q
             j = len(names)
             if joint.nv == 0 and index in followers:
                 continue

@@ -52,7 +52,7 @@ def test_robot_is_imported_and_examined(tmp_path: Path, run: RunCommand) -> None
 @pytest.mark.parametrize(
     ("command", "part"),
     [
-        ("import-robot none.urdf", "cannot read the URDF, xacro or MJCF"),
+        ("import-robot none.urdf", "cannot read the URDF, xacro, MJCF or SDF"),
         ("import-robot given/robot.urdf --output given", "got other files"),
         ("import-robot given/robot.urdf --package meshes", "NAME=FOLDER"),
         ("import-home none.xml", "none.xml"),

@@ -15,7 +15,7 @@ import trimesh
 
 from vkc_pin.importing import import_home, import_object, import_robot
 from vkc_pin.importing.objects.clean_up import rename_for_scenes
-from vkc_pin.importing.objects.object_import import read_description
+from vkc_pin.importing.objects.object_reading import read_object
 from vkc_pin.importing.robots.sources import read_source
 
 from .files import DAE
@@ -125,7 +125,7 @@ def _import(file: Path, kind: str, root: Path, complete: bool) -> str:
         else:
             read_source(file, root / "scratch", packages={}, arguments={})
     elif not complete:
-        rename_for_scenes(read_description(file, free=True))
+        rename_for_scenes(read_object(file, free=True))
     elif file.suffix == ".xml":
         import_home(file, root / "out", most=1)
     else:

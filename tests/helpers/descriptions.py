@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.importing.objects.description import Description, Joint, Link, Part
+from vkc_pin.importing.description import Description, Joint, Link, Part
 
 CUBE = (0.1, 0.1, 0.1)
 

@@ -8,9 +8,9 @@ import trimesh
 from helpers.descriptions import make_part
 
 import vkc_pin as vkc
+from vkc_pin.importing.description import Link
 from vkc_pin.importing.homes.splitting import Home
 from vkc_pin.importing.homes.writing import measure_parts
-from vkc_pin.importing.objects.description import Link
 from vkc_pin.importing.progress import ImportProgress
 
 

@@ -27,9 +27,11 @@ if TYPE_CHECKING:
 
 def add_importing(commands: Any) -> None:
     """Add the commands to those of a parser."""
-    about = "Import a robot from a URDF, xacro or MJCF file as a folder, and report all guesses."
+    about = (
+        "Import a robot from a URDF, xacro, MJCF or SDF file, and report all guesses."
+    )
     robot = add_command(commands, "import-robot", "import a robot", _import_robot, about)
-    add_option(robot, "file FILE", "URDF, xacro or MJCF")
+    add_option(robot, "file FILE", "URDF, xacro, MJCF or SDF")
     _add_output(robot, "import-robot")
     add_option(robot, "--arm NAME", "the arm to plan for, or a part of its name, e.g. left")
     add_option(robot, "--tool-frame FRAME", "the tool frame, if it is not to be guessed")

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pinocchio as pin
 
 from vkc_pin.errors import InputError
 from vkc_pin.world.files.writing import MANIFEST, check_writable
@@ -39,28 +37,6 @@ def format_comment(text: str) -> str:
 def round_values(values: Any, digits: int = 6) -> list[float]:
     """Return rounded values without negative zeros."""
     return [float(value) + 0.0 for value in np.round(np.asarray(values, float), digits) + 0.0]
-
-
-def format_numbers(values: Any) -> str:
-    """Format numbers for an attribute of a URDF."""
-    return " ".join(f"{value:.9g}" for value in values)
-
-
-def add_connection(
-    root: ElementTree.Element, name: str, kind: str, parent: str, child: str, placement: pin.SE3
-) -> ElementTree.Element:
-    """Add a joint to a URDF and return it."""
-    joint = ElementTree.SubElement(root, "joint", name=name, type=kind)
-    add_origin(joint, placement)
-    ElementTree.SubElement(joint, "parent", link=parent)
-    ElementTree.SubElement(joint, "child", link=child)
-    return joint
-
-
-def add_origin(element: ElementTree.Element, placement: pin.SE3) -> None:
-    """Add an <origin> to an element of a URDF."""
-    xyz, rpy = placement.translation, pin.rpy.matrixToRpy(placement.rotation)
-    ElementTree.SubElement(element, "origin", xyz=format_numbers(xyz), rpy=format_numbers(rpy))
 
 
 def check_source(file: Path, expected: str) -> None:

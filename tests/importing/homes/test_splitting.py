@@ -7,8 +7,8 @@ from helpers.descriptions import make_description, make_joint, make_mesh_part, m
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from vkc_pin.importing.description import Joint, Link
 from vkc_pin.importing.homes.splitting import Home, add_floor, split_home
-from vkc_pin.importing.objects.description import Joint, Link
 
 
 def make_link(name: str, size: tuple[float, ...] = (0.2, 0.2, 0.2), z: float = 0.5) -> Link:

@@ -10,6 +10,7 @@ import trimesh
 from helpers.descriptions import make_description, make_mesh_part, make_part
 
 import vkc_pin as vkc
+from vkc_pin.importing.description import Link
 from vkc_pin.importing.homes.splitting import Home, HomeObject
 from vkc_pin.importing.homes.writing import (
     ImportedHomeObject,
@@ -17,7 +18,6 @@ from vkc_pin.importing.homes.writing import (
     write_object,
     write_obstacles,
 )
-from vkc_pin.importing.objects.description import Link
 from vkc_pin.importing.progress import ImportProgress
 from vkc_pin.world.models.articulated_object import ArticulatedObject
 

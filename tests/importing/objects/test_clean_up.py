@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
+from vkc_pin.importing.description import Description, Link
 from vkc_pin.importing.objects.clean_up import (
     choose_name,
     compute_bounds,
@@ -20,14 +21,13 @@ from vkc_pin.importing.objects.clean_up import (
     merge_fixed_links,
     scale_object,
 )
-from vkc_pin.importing.objects.description import Description, Link
-from vkc_pin.importing.objects.urdf import read_object_urdf
+from vkc_pin.importing.objects.object_reading import read_object
 from vkc_pin.world.files.fields import Name
 
 
 @pytest.fixture
 def cabinet(tmp_path: Path) -> Description:
-    return read_object_urdf(write_partnet_object(tmp_path))
+    return read_object(write_partnet_object(tmp_path))
 
 
 def compute_box(description: Description, **values: float) -> np.ndarray:
@@ -48,7 +48,7 @@ def test_fixed_links_are_merged(cabinet: Description) -> None:
 def test_scaling_scales_shapes_and_limits(
     factor: float, slide: float, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    cabinet = read_object_urdf(write_partnet_object(tmp_path_factory.mktemp("p") / "x"))
+    cabinet = read_object(write_partnet_object(tmp_path_factory.mktemp("p") / "x"))
     large = scale_object(cabinet, factor)
     one = compute_box(cabinet, joint_0=slide)
     other = compute_box(large, joint_0=factor * slide)

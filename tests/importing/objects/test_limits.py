@@ -13,10 +13,10 @@ from helpers.descriptions import make_description, make_joint, make_part
 from helpers.partnet import write_partnet_object
 
 import vkc_pin as vkc
+from vkc_pin.importing.description import Description, Link
 from vkc_pin.importing.objects.clean_up import compute_bounds, load_surfaces, merge_fixed_links
-from vkc_pin.importing.objects.description import Description, Link
 from vkc_pin.importing.objects.limits import add_missing_limits
-from vkc_pin.importing.objects.urdf import read_object_urdf
+from vkc_pin.importing.objects.object_reading import read_object
 
 
 def compute_box(description: Description, **values: float) -> np.ndarray:
@@ -24,7 +24,7 @@ def compute_box(description: Description, **values: float) -> np.ndarray:
 
 
 def test_missing_limits_open_outwards(tmp_path: Path) -> None:
-    found = merge_fixed_links(read_object_urdf(write_partnet_object(tmp_path)))
+    found = merge_fixed_links(read_object(write_partnet_object(tmp_path)))
     limited = add_missing_limits(found)
     low, high = limited.joints["link_1"].limits or (0.0, 0.0)
     assert sorted(map(abs, (low, high))) == pytest.approx([0.0, np.pi / 2])

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import vkc_pin as vkc
+from vkc_pin.importing.description import Description
 from vkc_pin.importing.objects.clean_up import merge_fixed_links
-from vkc_pin.importing.objects.description import Description
-from vkc_pin.importing.objects.object_import import read_description
+from vkc_pin.importing.objects.object_reading import read_object
 
 AXES = ("1 0 0", "0 1 0", "0 0 1")
 
@@ -214,7 +214,7 @@ def test_every_joint_moves_the_mass_of_its_rigid_group(
         pytest.importorskip("mujoco")
     file = tmp_path_factory.mktemp("tree") / f"tree.{ending}"
     file.write_text(write(tree))
-    merged = merge_fixed_links(read_description(file))
+    merged = merge_fixed_links(read_object(file))
     assert_equal(list_inertias(merged), compute(tree))  # type: ignore[arg-type]
     dead = {f"j{k}" for k, body in enumerate(tree) if body.is_hinged} - set(list_inertias(merged))
     noted = {name for name in dead if any(f"joint '{name}' moves" in n for n in merged.notes)}

@@ -11,7 +11,7 @@ import trimesh
 from helpers.partnet import SDF, write_partnet_object
 
 import vkc_pin as vkc
-from vkc_pin.importing.objects.object_import import read_description
+from vkc_pin.importing.objects.object_reading import read_object
 from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.placed_object import make_world_shapes
 
@@ -117,7 +117,7 @@ def test_invalid_arguments_are_rejected(
 def test_other_xml_is_rejected(tmp_path: Path) -> None:
     (tmp_path / "page.xml").write_text("<html/>")
     with pytest.raises(vkc.InputError, match=r"page\.xml.*<html>"):
-        read_description(tmp_path / "page.xml")
+        read_object(tmp_path / "page.xml")
 
 
 def test_packages_and_arguments_of_xacro_are_used(tmp_path: Path) -> None:
@@ -133,7 +133,7 @@ def test_packages_and_arguments_of_xacro_are_used(tmp_path: Path) -> None:
           <child link="front"/><limit lower="0" upper="$(arg depth)"/></joint></robot>"""
     )
     packages = {"furniture": tmp_path / "parts"}
-    found = read_description(file, packages=packages, arguments={"depth": "0.25"})
+    found = read_object(file, packages=packages, arguments={"depth": "0.25"})
     assert found.joints["front"].limits == (0.0, 0.25)
     assert found.links["case"].collision[0].file == tmp_path / "parts" / "case.stl"
 

@@ -7,8 +7,8 @@ import pinocchio as pin
 import trimesh
 from helpers.descriptions import make_description, make_joint, make_mesh_part, make_part
 
+from vkc_pin.importing.description import Link
 from vkc_pin.importing.objects.clean_up import load_surfaces
-from vkc_pin.importing.objects.description import Link
 from vkc_pin.importing.objects.pieces import PieceCache, decompose_links
 
 

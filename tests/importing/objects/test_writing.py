@@ -9,8 +9,8 @@ import trimesh
 import yaml
 from helpers.descriptions import make_description, make_joint, make_mesh_part, make_part
 
-from vkc_pin.importing.objects.description import Link, Part
-from vkc_pin.importing.objects.urdf import read_object_urdf
+from vkc_pin.importing.description import Link, Part
+from vkc_pin.importing.objects.object_reading import read_object
 from vkc_pin.importing.objects.writing import write_description, write_urdf
 from vkc_pin.world.files.urdf import read_urdf
 
@@ -35,7 +35,7 @@ def test_written_object_is_read_back(tmp_path: Path) -> None:
     links = [Link("a", parts[:1], parts[:1]), Link("b", parts, parts, inertia)]
     urdf, yaml_file = tmp_path / "thing.urdf", tmp_path / "thing.yaml"
     write_urdf(make_description(links, [joint]), urdf)
-    found = read_object_urdf(urdf)
+    found = read_object(urdf)
     assert found.links["b"].inertia.isApprox(inertia, 1e-6)
     assert [part.name for part in found.links["a"].collision] == ["handle & bar"]
     for link in links:

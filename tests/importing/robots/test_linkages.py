@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.importing.robots.mjcf import convert_mjcf
+from vkc_pin.importing.robots.sources import read_source
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -59,7 +59,12 @@ def write_linkage(
 @pytest.mark.parametrize("coupled", [COUPLED, ""])
 def test_linkages_stay_closed(tmp_path: Path, connect: str, coupled: str) -> None:
     """The linkage is a parallelogram: the finger stays upright at every driver angle."""
-    converted = convert_mjcf(write_linkage(tmp_path, connect=connect, coupled=coupled), tmp_path)
+    converted = read_source(
+        write_linkage(tmp_path, connect=connect, coupled=coupled),
+        tmp_path,
+        packages={},
+        arguments={},
+    )
     assert len(converted.linkages) == (1 if coupled else 2)
     angles = set()
     for linkage in converted.linkages:

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import mujoco
@@ -9,7 +8,7 @@ import pinocchio as pin
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.importing.robots.mjcf import convert_mjcf
+from vkc_pin.importing.robots.sources import Source, read_source
 from vkc_pin.world.files.kinematic_tree import check_tree
 from vkc_pin.world.models.robot_model import make_configuration
 
@@ -41,6 +40,10 @@ ARM = """
 </mujoco>"""
 
 
+def read_robot(file: Path) -> Source:
+    return read_source(file, file.parent / "meshes", packages={}, arguments={})
+
+
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
     path = tmp_path / "arm.xml"
@@ -48,14 +51,16 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
-def test_link_placements_agree_with_mujoco(file: Path, tmp_path: Path) -> None:
+def test_shapes_are_where_mujoco_has_them(file: Path, tmp_path: Path) -> None:
     """Bodies have several joints, anchors away from the origin, and reference positions."""
-    root = convert_mjcf(file, tmp_path / "meshes").root
-    for limit in root.iter("limit"):  # required by Pinocchio
-        limit.attrib.update(effort="1", velocity="1")
-    model = pin.buildModelFromXML(ElementTree.tostring(root, encoding="unicode"))
+    robot = read_robot(file).file
+    model = pin.buildModelFromXML(robot.text)
+    shapes = robot.read_shapes("collision")
+    assert [shape.link for shape in shapes] == ["foot", "upper", "fore", "tip"]
     reference = mujoco.MjModel.from_xml_path(str(file))
-    state, data, rng = mujoco.MjData(reference), model.createData(), np.random.default_rng(3)
+    state = mujoco.MjData(reference)
+    data = model.createData()
+    rng = np.random.default_rng(3)
     for _ in range(5):
         state.qpos[:] = rng.uniform(-0.5, 0.5, reference.nq)
         mujoco.mj_kinematics(reference, state)
@@ -64,15 +69,17 @@ def test_link_placements_agree_with_mujoco(file: Path, tmp_path: Path) -> None:
             reference.joint(j).name: moved[reference.jnt_qposadr[j]] for j in range(reference.njnt)
         }
         pin.framesForwardKinematics(model, data, make_configuration(model, positions))
-        for name in ("foot", "upper", "fore", "tip"):
-            place = data.oMf[model.getFrameId(name, pin.FrameType.BODY)]
-            np.testing.assert_allclose(place.translation, state.body(name).xpos, atol=1e-7)
-            np.testing.assert_allclose(place.rotation.ravel(), state.body(name).xmat, atol=1e-7)
+        for shape in shapes:
+            frame = data.oMf[model.getFrameId(shape.link, pin.FrameType.BODY)]
+            place = frame * shape.placement
+            geom = reference.body(shape.link).geomadr[0]  # the first one of its body collides
+            np.testing.assert_allclose(place.translation, state.geom_xpos[geom], atol=1e-7)
+            np.testing.assert_allclose(place.rotation.ravel(), state.geom_xmat[geom], atol=1e-7)
 
 
 def test_limits_shapes_couplings_and_states_are_converted(file: Path, tmp_path: Path) -> None:
-    converted = convert_mjcf(file, tmp_path / "meshes")
-    joints = {joint.get("name"): joint for joint in converted.root.findall("joint")}
+    converted = read_robot(file)
+    joints = {joint.get("name"): joint for joint in converted.file.root.findall("joint")}
 
     def limit(name: str, key: str) -> float:
         return float(joints[name].find("limit").get(key, "nan"))  # type: ignore[union-attr]
@@ -83,11 +90,13 @@ def test_limits_shapes_couplings_and_states_are_converted(file: Path, tmp_path: 
     mimic = joints["jaw"].find("mimic")
     assert mimic is not None
     assert mimic.attrib == {"joint": "out", "multiplier": "0.1", "offset": "0.01"}
-    assert converted.states["home"]["lift"] == pytest.approx(0.4 - np.radians(10))
-    fore = next(link for link in converted.root.findall("link") if link.get("name") == "fore")
+    (home,) = converted.srdf.states
+    assert home.name == "home"
+    assert home.positions["lift"] == pytest.approx(0.4 - np.radians(10))
+    fore = next(link for link in converted.file.root.findall("link") if link.get("name") == "fore")
     assert [element.find("geometry")[0].tag for element in fore.findall("collision")] == ["mesh"]  # type: ignore[index]
-    assert len(fore.findall("visual")) == 1
-    masses = sum(float(element.get("value", "0")) for element in converted.root.iter("mass"))
+    assert len(fore.findall("visual")) == 2  # MuJoCo's viewer shows both
+    masses = sum(float(element.get("value", "0")) for element in converted.file.root.iter("mass"))
     reference = mujoco.MjModel.from_xml_path(str(file))
     arm = reference.body_rootid == reference.body("foot").id
     assert masses == pytest.approx(reference.body_mass[arm].sum(), rel=1e-6)
@@ -103,7 +112,7 @@ def test_errors_name_the_invalid_file(tmp_path: Path) -> None:
         path = tmp_path / name
         path.write_text(f"<mujoco><worldbody><body>{content}</body></worldbody></mujoco>")
         with pytest.raises(vkc.InputError, match=message) as caught:
-            convert_mjcf(path, tmp_path)
+            read_robot(path)
         assert caught.value.file == path
 
 
@@ -146,14 +155,15 @@ def test_couplings_become_a_tree(
         f"<mujoco><worldbody>{bodies}{'</body>' * 3}</worldbody>"
         f"<equality>{equalities}</equality></mujoco>"
     )
-    converted = convert_mjcf(path, tmp_path / "meshes")
+    converted = read_robot(path)
     mimics = {
         joint.get("name"): mimic.attrib
-        for joint in converted.root.findall("joint")
+        for joint in converted.file.root.findall("joint")
         if (mimic := joint.find("mimic")) is not None
     }
     assert {name: mimic["joint"] for name, mimic in mimics.items()} == follows
-    assert any(expected_note in note for note in converted.notes) == bool(expected_note)
+    notes = [note for note in converted.notes if "follows" in note]
+    assert any(expected_note in note for note in notes) == bool(expected_note)
     if follows.get("j2") == "j0":
         assert mimics["j2"] == {"joint": "j0", "multiplier": "0.5", "offset": "-0.05"}
 
@@ -167,7 +177,7 @@ def test_similar_names_become_distinct_links_and_joints(tmp_path: Path) -> None:
     path = tmp_path / "arm.xml"
     base = f'<body name="base"><geom size="0.2"/>{bodies}</body>'
     path.write_text(f"<mujoco><worldbody>{base}</worldbody></mujoco>")
-    root = convert_mjcf(path, tmp_path / "meshes").root
+    root = read_robot(path).file.root
     check_tree(path, root)
     radii = {
         link.get("name"): float(sphere.attrib["radius"])

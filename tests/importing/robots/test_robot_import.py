@@ -153,7 +153,7 @@ def test_folder_is_replaced_only_with_force_and_kept_on_failure(tmp_path: Path) 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("<sdf/>", r"expected <robot> \(URDF or xacro\) or <mujoco> \(MJCF\), got <sdf>"),
+        ("<world/>", r"expected a URDF or xacro \(<robot>\), MJCF .* or SDF .*, got <world>"),
         ("<robot name='x'><link name='a'/></robot>", "the robot has no shapes"),
         ("not xml", "the file is not XML"),
     ],
@@ -253,7 +253,7 @@ STUCK = ("the gripper does not move: its fingers stay", False)
 @pytest.mark.parametrize(
     ("finger", "limits", "expected", "healthy"),
     [
-        ("revolute", (0.0, 0.0), "a_joint 0.0 to 0.0, right_finger_b_joint 0.0 to 0.0", False),
+        ("revolute", (0.0, 0.0), "a_joint 0 to 0, right_finger_b_joint 0 to 0", False),
         ("prismatic", (0.0, 0.0), *STUCK),
         pytest.param("prismatic", (0.0, 0.001), *STUCK, marks=pytest.mark.long),
         pytest.param("continuous", (0.0, 0.0), *STUCK, marks=pytest.mark.long),

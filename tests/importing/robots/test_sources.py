@@ -7,7 +7,7 @@ from helpers.arm_urdf import write_arms
 from helpers.texts import replace_in_file
 
 import vkc_pin as vkc
-from vkc_pin.importing.parsers import expand_xacro
+from vkc_pin.importing.formats.xacro import expand_xacro
 from vkc_pin.importing.robots.sources import Source, read_source
 from vkc_pin.world.files import resources
 from vkc_pin.world.files.urdf import read_urdf

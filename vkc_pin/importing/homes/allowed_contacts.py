@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from vkc_pin.errors import InputError
+from vkc_pin.importing.description import Description
 from vkc_pin.importing.homes.splitting import Home
-from vkc_pin.importing.objects.description import Description
 from vkc_pin.world.files.srdf import AllowedPairs, find_srdf, format_names, read_allowed_pairs
 from vkc_pin.world.files.xml import read_xml
 

@@ -28,8 +28,7 @@ from vkc_pin.importing.objects.clean_up import (
     move_root,
     rename_for_scenes,
 )
-from vkc_pin.importing.objects.description import WEIGHTLESS
-from vkc_pin.importing.objects.object_import import read_description
+from vkc_pin.importing.objects.object_reading import WEIGHTLESS, read_object
 from vkc_pin.importing.objects.pieces import PieceCache
 from vkc_pin.importing.progress import ImportProgress
 from vkc_pin.importing.scenes import locate_robot, refer_to_robot, write_scene
@@ -147,7 +146,7 @@ def import_home(  # noqa: PLR0913 - keyword options of a public call
     check_source(path, "a URDF, xacro, MJCF or SDF file")
     check_target(target, _COMMAND, force=check_bool(force, "force"))
     srdf_path = None if srdf is None else check_path(srdf, "srdf")
-    original = read_description(path, free=True, packages=packages, arguments=arguments)
+    original = read_object(path, free=True, packages=packages, arguments=arguments)
     original = original.check_meshes(is_home=True)
     description = rename_for_scenes(original)
     contacts = read_home_contacts(path, srdf_path, original.links, description.links)

@@ -10,18 +10,16 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.importing.description import Description, Joint, Link
 from vkc_pin.importing.objects.clean_up import (
     MOVING,
     collect_attached_links,
     compute_bounds,
-    extract_subtree,
     find_closed_positions,
     fix_immovable_joints,
     load_surfaces,
     move_root,
-    rename,
 )
-from vkc_pin.importing.objects.description import Description, Joint, Link
 from vkc_pin.utils.arrays import Floats
 
 FLOOR_RISE = 0.02
@@ -178,7 +176,7 @@ def _extract_links(
     description: Description, root: str, links_of_object: Collection[str]
 ) -> Description:
     """Return some links and the joints between them as a description without notes."""
-    part = extract_subtree(description, root)
+    part = description.extract_subtree(root)
     links = {name: link for name, link in part.links.items() if name in links_of_object}
     return Description(
         description.file,
@@ -217,7 +215,8 @@ def _remove_prefix(description: Description, prefix: str) -> Description:
     names = {name: name.removeprefix(prefix) for name in description.links}
     if len(set(names.values())) < len(names):
         return description
-    return rename(description, names, lambda name: name.removeprefix(prefix))
+    joints = {child: joint.name.removeprefix(prefix) for child, joint in description.joints.items()}
+    return description.rename(names, joints)
 
 
 def _measure_length(link: Link) -> float:

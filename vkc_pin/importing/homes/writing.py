@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
+from vkc_pin.importing.description import Colour, Description, Joint, Link, Part
 from vkc_pin.importing.homes.splitting import Home, HomeObject
 from vkc_pin.importing.objects.clean_up import (
     choose_name,
@@ -20,7 +21,6 @@ from vkc_pin.importing.objects.clean_up import (
     merge_fixed_links,
     move_root,
 )
-from vkc_pin.importing.objects.description import Colour, Description, Joint, Link, Part
 from vkc_pin.importing.objects.limits import add_missing_limits
 from vkc_pin.importing.objects.pieces import MeshKeys, PieceCache, decompose_links, measure_links
 from vkc_pin.importing.objects.writing import write_description, write_urdf

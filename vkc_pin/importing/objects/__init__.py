@@ -1,1 +1,1 @@
-"""Imports articulated objects from URDF, MJCF and SDF files."""
+"""Imports articulated objects from files of other programs."""

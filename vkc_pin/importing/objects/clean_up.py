@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.importing.objects.description import Description, Link, Part
+from vkc_pin.errors import InputError
+from vkc_pin.importing.description import Description, Link, Part
 from vkc_pin.utils.arrays import Floats
 
 if TYPE_CHECKING:
@@ -23,20 +23,6 @@ MOVING = ("revolute", "continuous", "prismatic")
 Surfaces = Mapping[int, "trimesh.Trimesh"]
 """Surfaces of parts in the frame of their link, by `id` of the part."""
 _UP = {"z": np.eye(3), "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])}
-
-
-def extract_subtree(description: Description, link: str) -> Description:
-    """Return a link and its descendants as an object of their own."""
-    if link not in description.links:
-        raise UnknownNameError("link", link, description.links, file=description.file, field="link")
-    subtree = description.subtree(link)
-    links = {name: item for name, item in description.links.items() if name in subtree}
-    joints = {
-        child: joint
-        for child, joint in description.joints.items()
-        if child in subtree and child != link
-    }
-    return dataclasses.replace(description, links=links, joints=joints)
 
 
 def find_multiple_objects(description: Description) -> tuple[str, ...]:
@@ -83,35 +69,13 @@ def choose_name(wanted: str, taken: set[str]) -> str:
 
 def rename_for_scenes(description: Description) -> Description:
     """Return the object with names of links and joints that scenes and steps accept."""
-    links_taken, joints_taken = set[str](), set[str]()
+    links_taken = set[str]()
+    joints_taken = set[str]()
     links = {name: choose_name(name, links_taken) for name in description.links}
-    return rename(description, links, lambda name: choose_name(name, joints_taken))
-
-
-def rename(
-    description: Description, names: Mapping[str, str], name_joint: Callable[[str], str]
-) -> Description:
-    """Return an object with other names.
-
-    Args:
-        description: The object.
-        names: New name of each link.
-        name_joint: Returns the new name of a joint.
-    """
-    links = {
-        names[name]: dataclasses.replace(link, name=names[name])
-        for name, link in description.links.items()
-    }
     joints = {
-        names[child]: dataclasses.replace(
-            joint,
-            name=name_joint(joint.name),
-            parent=names[joint.parent],
-            child=names[child],
-        )
-        for child, joint in description.joints.items()
+        child: choose_name(joint.name, joints_taken) for child, joint in description.joints.items()
     }
-    return dataclasses.replace(description, links=links, joints=joints)
+    return description.rename(links, joints)
 
 
 def fix_immovable_joints(description: Description) -> Description:

@@ -10,8 +10,8 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.importing.convex import ERROR
+from vkc_pin.importing.description import SOLIDS, Description, Joint
 from vkc_pin.importing.objects.clean_up import compute_bounds, load_surfaces, place_vertices
-from vkc_pin.importing.objects.description import SOLIDS, Description, Joint
 from vkc_pin.world.files.meshes import make_convex_hull
 from vkc_pin.world.models.shapes import compute_shape_distance, compute_world_box
 

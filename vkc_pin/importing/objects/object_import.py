@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,10 +12,9 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
-from vkc_pin.importing.formats import check_no_arguments, read_root
+from vkc_pin.importing.description import Description
 from vkc_pin.importing.objects.clean_up import (
     compute_bounds,
-    extract_subtree,
     find_closed_positions,
     find_multiple_objects,
     load_surfaces,
@@ -26,14 +24,10 @@ from vkc_pin.importing.objects.clean_up import (
     rename_for_scenes,
     scale_object,
 )
-from vkc_pin.importing.objects.description import WEIGHTLESS, Description
 from vkc_pin.importing.objects.limits import add_missing_limits
-from vkc_pin.importing.objects.mjcf import read_object_mjcf
+from vkc_pin.importing.objects.object_reading import WEIGHTLESS, read_object
 from vkc_pin.importing.objects.pieces import PLACES_WORK, decompose_links, measure_links
-from vkc_pin.importing.objects.sdf import read_object_sdf
-from vkc_pin.importing.objects.urdf import read_object_urdf
 from vkc_pin.importing.objects.writing import write_description, write_urdf
-from vkc_pin.importing.parsers import expand_xacro, uses_xacro
 from vkc_pin.importing.pictures import plot_attachments
 from vkc_pin.importing.progress import ImportProgress
 from vkc_pin.importing.proposals.proposal import Proposals
@@ -47,7 +41,6 @@ from vkc_pin.utils.arguments import (
     check_coordinate,
     check_instance,
     check_integer,
-    check_mapping,
     check_text,
 )
 from vkc_pin.utils.arrays import Floats
@@ -101,61 +94,6 @@ class ImportedObject:
             self.proposals.summary(),
         ]
         return "\n".join(lines)
-
-
-def read_description(
-    file: str | Path,
-    *,
-    free: bool = False,
-    packages: Mapping[str, str | Path] | None = None,
-    arguments: Mapping[str, str] | None = None,
-) -> Description:
-    """Read a URDF, xacro, MJCF or SDF file, whose first element tells its format.
-
-    Warnings become notes of the description.
-
-    Args:
-        file: The file.
-        free: Whether to keep free bodies, on floating joints.
-        packages: Folders of packages by name; others are searched for around the file.
-        arguments: Arguments of a xacro file.
-    """
-    path = check_path(file, "file", "a URDF, xacro, MJCF or SDF file")
-    folders = {
-        name: check_path(value, f"packages['{name}']", "a folder")
-        for name, value in check_mapping(packages or {}, "packages").items()
-    }
-    given = {
-        name: str(value) for name, value in check_mapping(arguments or {}, "arguments").items()
-    }
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        description = _read_format(path, folders, given, free=free)
-    notes = dict.fromkeys(str(warning.message) for warning in caught)
-    description = dataclasses.replace(description, notes=(*description.notes, *notes))
-    return description.clip_resistances()
-
-
-def _read_format(
-    path: Path, packages: Mapping[str, Path], arguments: Mapping[str, str], *, free: bool
-) -> Description:
-    _, root = read_root(path, "URDF, xacro, MJCF or SDF")
-    if root.tag == "robot" and uses_xacro(root, path):
-        text = expand_xacro(path, packages, arguments)
-        return read_object_urdf(path, free=free, packages=packages, text=text)
-    check_no_arguments(path, arguments)
-    if root.tag == "robot":
-        return read_object_urdf(path, free=free, packages=packages)
-    if root.tag == "mujoco":
-        return read_object_mjcf(path, free=free)
-    if root.tag == "sdf":
-        return read_object_sdf(path, free=free, packages=packages)
-    raise InputError(
-        "the file does not describe an object",
-        file=path,
-        expected="a URDF or xacro (<robot>), MJCF (<mujoco>) or SDF (<sdf>) file",
-        got=f"<{root.tag}>",
-    )
 
 
 def import_object(  # noqa: PLR0913 - keyword options of a public call
@@ -212,20 +150,11 @@ def import_object(  # noqa: PLR0913 - keyword options of a public call
     target = Path(name) if folder is None else check_path(folder, "folder", "a folder")
     check_source(path, "a URDF, xacro, MJCF or SDF file")
     check_target(target, _COMMAND, force=check_bool(force, "force"))
-    description = read_description(path, packages=packages, arguments=arguments)
-    description = (
-        extract_subtree(description, link)
-        if link is not None
-        else dataclasses.replace(
-            description, notes=description.notes + find_multiple_objects(description)
-        )
-    )
-    description = description.check_meshes()
-    description = make_upright(merge_fixed_links(rename_for_scenes(description)), up)
-    description, size = _scale_to_size(description, height, scale)
+    description = _read_single_object(path, link, packages, arguments)
+    description, size = _scale_to_size(make_upright(description, up), height, scale)
     description = _place_on_floor(description)
     if description.is_massless:
-        description = dataclasses.replace(description, notes=(*description.notes, WEIGHTLESS))
+        description = description.add_notes(WEIGHTLESS)
     work = [measure_links([link], set()) for link in description.links.values()]
     progress = ImportProgress([*work, PLACES_WORK * len(description.joints)])
     description = decompose_links(description, load_surfaces(description), progress=progress)
@@ -268,6 +197,22 @@ def import_object(  # noqa: PLR0913 - keyword options of a public call
     )
 
 
+def _read_single_object(
+    path: Path,
+    link: str | None,
+    packages: Mapping[str, str | Path] | None,
+    arguments: Mapping[str, str] | None,
+) -> Description:
+    """Return the object of a file, or one link of it with its descendants, without fixed joints."""
+    description = read_object(path, packages=packages, arguments=arguments)
+    if link is not None:
+        description = description.extract_subtree(link)
+    else:
+        description = description.add_notes(*find_multiple_objects(description))
+    description = rename_for_scenes(description.check_meshes())
+    return merge_fixed_links(description)
+
+
 def _check_size(height: float | None, scale: float | None) -> None:
     """Raise InputError unless at most one is given, a positive number."""
     for name, value in (("height", height), ("scale", scale)):
@@ -305,7 +250,7 @@ def _scale_to_size(
             f"the object is {size[2]:.3g} m high: "
             "if this is wrong, state its height (height) or the unit of the file (scale)"
         )
-        description = dataclasses.replace(description, notes=(*description.notes, note))
+        description = description.add_notes(note)
     return scale_object(description, factor), size
 
 

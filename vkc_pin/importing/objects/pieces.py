@@ -11,8 +11,8 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.importing.convex import ERROR, Pieces, decompose, is_flat, measure_outside
+from vkc_pin.importing.description import Description, Link, Part
 from vkc_pin.importing.objects.clean_up import Surfaces
-from vkc_pin.importing.objects.description import Description, Link, Part
 from vkc_pin.importing.progress import ImportProgress
 from vkc_pin.world.files.hulls import SHEET_THICKNESS
 

@@ -1,1 +1,1 @@
-"""Imports robots from URDF, xacro and MJCF files, and derives a robot.yaml."""
+"""Imports robots from files of other programs, and derives a robot.yaml."""

@@ -47,12 +47,12 @@ from vkc_pin.importing.robots.rest_configuration import (
 from vkc_pin.importing.robots.sources import Source, choose_free_name, read_source
 from vkc_pin.importing.scenes import make_robot_scene, write_scene
 from vkc_pin.importing.targets import (
-    add_connection,
     check_source,
     check_target,
     format_comment,
     get_origin_marker,
 )
+from vkc_pin.importing.urdf_writing import add_connection
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import check_bool, check_integer, check_mapping, check_text
 from vkc_pin.utils.arrays import Floats
@@ -118,7 +118,7 @@ def import_robot(  # noqa: PLR0913 - keyword options of a public call
     seed: int = 0,
     force: bool = False,
 ) -> ImportedRobot:
-    """Import a robot from a URDF, xacro or MJCF file.
+    """Import a robot from a URDF, xacro, MJCF or SDF file.
 
     The output folder holds robot.yaml, a URDF with a frame `tool` where the hand grasps, an SRDF
     with sampled pairs that need no check, and meshes, with convex pieces for collision; scene.yaml,
@@ -148,7 +148,7 @@ def import_robot(  # noqa: PLR0913 - keyword options of a public call
             extra `import` is missing.
         UnknownNameError: The arm or frame is unknown; the error names the nearest one.
     """
-    path = check_path(file, "file", "a URDF, xacro or MJCF file")
+    path = check_path(file, "file", "a URDF, xacro, MJCF or SDF file")
     (name,) = choose_file_names([path.name.split(".")[0]], fallback="robot")
     target = Path(name) if folder is None else check_path(folder, "folder", "a folder")
     for field, given in (("arm", arm), ("tool_frame", tool_frame)):
@@ -165,7 +165,7 @@ def import_robot(  # noqa: PLR0913 - keyword options of a public call
         key: str(value) for key, value in check_mapping(arguments or {}, "arguments").items()
     }
     srdf_path = None if srdf is None else check_path(srdf, "srdf")
-    check_source(path, "a URDF, xacro or MJCF file")
+    check_source(path, "a URDF, xacro, MJCF or SDF file")
     check_target(target, "import-robot", force=check_bool(force, "force"))
     # `check_target` allowed replacing it
     with write_folder_atomically(target, force=True, source=path) as staging:

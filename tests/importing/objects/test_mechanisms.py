@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.importing.objects.mjcf import read_object_mjcf
+from vkc_pin.importing.objects.object_reading import read_object
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -109,7 +109,7 @@ def test_joints_that_mujoco_holds_are_fixed_where_it_holds_them(
 ) -> None:
     text = CABINET.format(bodies=bodies, equalities=equalities)
     (tmp_path / "c.xml").write_text(text)
-    found = read_object_mjcf(tmp_path / "c.xml")
+    found = read_object(tmp_path / "c.xml")
     moving = {joint.name for joint in found.joints.values() if joint.kind == "revolute"}
     assert moving == joints
     model, data = simulate(text)
@@ -128,18 +128,18 @@ def test_joints_that_mujoco_holds_are_fixed_where_it_holds_them(
 def test_free_bodies_in_a_home_are_attached_or_stay_free(tmp_path: Path) -> None:
     text = CABINET.format(bodies=KNOB + LID, equalities='<weld body1="knob" body2="r"/>')
     (tmp_path / "c.xml").write_text(text)
-    joints = read_object_mjcf(tmp_path / "c.xml", free=True).joints
+    joints = read_object(tmp_path / "c.xml", free=True).joints
     assert (joints["knob"].kind, joints["knob"].parent) == ("fixed", "r")
     assert (joints["lid"].kind, joints["lid"].parent) == ("floating", "world")
-    assert "knob" in read_object_mjcf(tmp_path / "c.xml").links
-    assert "lid" not in read_object_mjcf(tmp_path / "c.xml").links
+    assert "knob" in read_object(tmp_path / "c.xml").links
+    assert "lid" not in read_object(tmp_path / "c.xml").links
 
 
 def test_joints_between_a_free_body_and_its_weld_are_held(tmp_path: Path) -> None:
     """The lid could still swing about its flap, which is on the leaf."""
     text = CABINET.format(bodies=LID, equalities='<weld body1="flap" body2="r"/>')
     (tmp_path / "c.xml").write_text(text)
-    found = read_object_mjcf(tmp_path / "c.xml")
+    found = read_object(tmp_path / "c.xml")
     assert {name: found.joints[name].kind for name in ("lid", "flap", "r")} == {
         "lid": "fixed",
         "flap": "fixed",
@@ -158,7 +158,7 @@ def test_equalities_of_tendons_are_noted(tmp_path: Path) -> None:
     (tmp_path / "c.xml").write_text(
         text.replace("</mujoco>", f"<tendon>{tendons}</tendon></mujoco>")
     )
-    assert any("'pair' of tendons" in note for note in read_object_mjcf(tmp_path / "c.xml").notes)
+    assert any("'pair' of tendons" in note for note in read_object(tmp_path / "c.xml").notes)
 
 
 def test_held_leaf_of_an_imported_cabinet_stands_open(tmp_path: Path) -> None:
@@ -202,9 +202,7 @@ def test_followers_keep_the_limits_that_their_leaders_reach(
         f'<mujoco><compiler angle="radian"/><worldbody>{bodies}</worldbody>'
         f"<equality>{couplings}</equality></mujoco>"
     )
-    found = {
-        joint.name: joint.limits for joint in read_object_mjcf(tmp_path / "t.xml").joints.values()
-    }
+    found = {joint.name: joint.limits for joint in read_object(tmp_path / "t.xml").joints.values()}
     assert found["right"] == pytest.approx(expected)
     assert found["third"] == pytest.approx((-expected[1], -expected[0]))
     assert found["one"] == (-1.5, 0.0)

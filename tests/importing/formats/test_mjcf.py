@@ -7,7 +7,7 @@ import pytest
 from helpers.partnet import MJCF
 
 from vkc_pin.errors import InputError
-from vkc_pin.importing.objects.mjcf import read_object_mjcf
+from vkc_pin.importing.objects.object_reading import read_object
 
 mujoco = pytest.importorskip("mujoco")
 
@@ -15,7 +15,7 @@ mujoco = pytest.importorskip("mujoco")
 def test_bodies_joints_and_shapes_are_read(tmp_path: Path) -> None:
     attributes = 'name="hinge" damping="0.4" frictionloss="0.2"'
     (tmp_path / "t.xml").write_text(MJCF.replace('name="hinge"', attributes))
-    found = read_object_mjcf(tmp_path / "t.xml")
+    found = read_object(tmp_path / "t.xml")
     assert list(found.links) == ["world", "case", "door"]
     hinge = found.joints["door"]
     assert (hinge.name, hinge.kind, hinge.limits) == ("hinge", "revolute", (-1.5, 0.0))
@@ -33,7 +33,7 @@ def test_bodies_joints_and_shapes_are_read(tmp_path: Path) -> None:
     notes = " ".join(found.notes)
     assert "'cup' is free" in notes
     assert "'floor'" in notes
-    with_free = read_object_mjcf(tmp_path / "t.xml", free=True)
+    with_free = read_object(tmp_path / "t.xml", free=True)
     cup = with_free.joints["cup"]
     assert (cup.kind, cup.parent) == ("floating", "world")
     assert cup.placement.translation == pytest.approx([2.0, 0.0, 0.0])
@@ -47,7 +47,7 @@ def test_inertia_agrees_with_mujoco(tmp_path: Path) -> None:
     model = mujoco.MjModel.from_xml_string(MJCF)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    found = read_object_mjcf(tmp_path / "t.xml", free=True)
+    found = read_object(tmp_path / "t.xml", free=True)
     for name, place in found.compute_placements().items():
         body = model.body(name).id
         inertia = place.act(found.links[name].inertia)
@@ -67,12 +67,12 @@ def test_unnamed_bodies_and_second_joints_get_unique_names(tmp_path: Path) -> No
         <body name="a_0"><joint name="z" range="-1 1"/><geom size="0.3"/></body>
         <body><geom size="0.4"/></body></body></worldbody></mujoco>"""
     )
-    found = read_object_mjcf(tmp_path / "t.xml")
+    found = read_object(tmp_path / "t.xml")
     assert list(found.links) == ["world", "case", "a_0_", "a", "a_0", "body_4"]
     assert (found.joints["a"].parent, found.joints["a"].name) == ("a_0_", "y")
     (tmp_path / "t.xml").write_text("<mujoco><worldbody><geom type='bx'/></worldbody></mujoco>")
     with pytest.raises(InputError, match=r"t\.xml"):
-        read_object_mjcf(tmp_path / "t.xml")
+        read_object(tmp_path / "t.xml")
 
 
 @pytest.mark.parametrize(
@@ -95,7 +95,7 @@ def test_springs_and_limits_are_relative_to_the_pose_in_the_file(
         f"""<mujoco><worldbody><geom size="0.1"/><body name="a"><geom size="0.2"/>
         <joint name="x" {joint}/></body></worldbody></mujoco>"""
     )
-    found = read_object_mjcf(tmp_path / "t.xml")
+    found = read_object(tmp_path / "t.xml")
     read = found.joints["a"]
     assert read.limits == (None if limits is None else pytest.approx(np.radians(limits)))
     assert (read.stiffness, np.degrees(read.springref)) == pytest.approx(spring)
@@ -115,7 +115,7 @@ def test_height_fields_are_left_out(tmp_path: Path, mesh: str, name: str) -> Non
         f'<geom {name} type="hfield" hfield="h"/><body name="b">{shape}</body>'
         "</worldbody></mujoco>"
     )
-    found = read_object_mjcf(tmp_path / "t.xml")
+    found = read_object(tmp_path / "t.xml")
     assert [part.name for link in found.links.values() for part in link.solid] == ["wedge"]
     title = "hills" if name else ""
     assert found.notes == (f"geom '{title}' of body 'world' is a height field: left out",)

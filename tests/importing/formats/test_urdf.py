@@ -8,12 +8,12 @@ from helpers.partnet import write_partnet_object
 from helpers.texts import format_fixed_link
 
 from vkc_pin.errors import InputError
-from vkc_pin.importing.objects.description import Description, Link
-from vkc_pin.importing.objects.urdf import read_object_urdf
+from vkc_pin.importing.description import Description, Link
+from vkc_pin.importing.objects.object_reading import read_object
 
 
 def test_missing_values_of_partnet_are_none(tmp_path: Path) -> None:
-    found = read_object_urdf(write_partnet_object(tmp_path))
+    found = read_object(write_partnet_object(tmp_path))
     assert found.root == "base"
     joints = {joint.name: joint for joint in found.joints.values()}
     assert joints["joint_0"].limits == (0.0, 0.36)
@@ -31,7 +31,7 @@ def test_missing_values_of_partnet_are_none(tmp_path: Path) -> None:
 def read_text(folder: Path, text: str, **options: bool) -> Description:
     """Read a URDF with these links and joints."""
     (folder / "t.urdf").write_text(f'<robot name="t">{text}</robot>')
-    return read_object_urdf(folder / "t.urdf", **options)
+    return read_object(folder / "t.urdf", **options)
 
 
 def format_joint(kind: str, child: str = "b", more: str = "") -> str:
@@ -44,19 +44,28 @@ LINKS = '<link name="a"/><link name="b"/><link name="c"/>'
 
 def test_swapped_limits_and_unsupported_joints_are_noted(tmp_path: Path) -> None:
     more = '<limit lower="1" upper="-0.5"/><mimic joint="k"/>'
-    swapped = format_joint("revolute", "b", f'{more}<dynamics damping="0.4" friction="-1"/>')
-    text = LINKS + swapped + format_joint("floating", "c")
+    swapped = format_joint("revolute", "b", f'{more}<dynamics damping="0.4" friction="0.1"/>')
+    text = LINKS + swapped + format_joint("planar", "c")
     found = read_text(tmp_path, text)
     joint = found.joints["b"]
     assert joint.limits == (-0.5, 1.0)
     assert np.allclose(joint.axis, [1.0, 0.0, 0.0])
-    assert (joint.damping, joint.friction) == (0.4, -1.0)
+    assert (joint.damping, joint.friction) == (0.4, 0.1)
     assert found.joints["c"].kind == "fixed"
-    for words in ("lower limit above its upper limit", "floating", "mimics"):
+    for words in ("lower limit above its upper limit", "is planar: taken as fixed", "follows 'k'"):
         assert words in " ".join(found.notes)
-    free = read_text(tmp_path, text, free=True)
-    assert free.joints["c"].kind == "floating"
-    assert "floating" not in " ".join(free.notes)
+
+
+def test_free_bodies_are_objects_of_their_own(tmp_path: Path) -> None:
+    text = LINKS + format_joint("fixed", "b") + format_joint("floating", "c")
+    box = '<link name="{}"><collision><geometry><box size="1 1 1"/></geometry></collision></link>'
+    solid = text.replace('<link name="a"/>', box.format("a"))
+    assert read_text(tmp_path, solid, free=True).joints["c"].kind == "floating"
+    beside = read_text(tmp_path, solid)
+    assert list(beside.links) == ["a", "b"]
+    assert beside.notes == ("body 'c' is free, hence a separate object: left out",)
+    alone = read_text(tmp_path, text.replace('<link name="c"/>', box.format("c")))
+    assert list(alone.links) == ["c"]
 
 
 @pytest.mark.parametrize(
@@ -156,7 +165,7 @@ def test_followers_keep_the_limits_that_their_leaders_reach(
         found = read_text(tmp_path, LINKS + joints)
         assert found.joints["c"].limits == pytest.approx(expected)
         (note,) = found.notes
-        assert "'to_c' mimics 'to_b': made independent" in note
+        assert "'to_c' follows 'to_b' (<mimic>): made independent" in note
 
 
 def test_chains_of_followers_are_limited_by_their_leader(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Reads objects and homes from SDF files (http://sdformat.org/spec), versions 1.2 to 1.12."""
+"""Reads SDF files (http://sdformat.org/spec), versions 1.2 to 1.12."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.importing.missing_meshes import MissingMesh
-from vkc_pin.importing.objects.description import (
+from vkc_pin.importing.description import (
+    Coupling,
     Description,
     Joint,
+    Limits,
     Link,
+    MissingMesh,
     Part,
-    limit_follower,
     make_inertia,
     make_limits,
 )
-from vkc_pin.importing.objects.sdf_scope import BASE, RULES, WORLD, Rules, Scope, is_true
+from vkc_pin.importing.formats.sdf_scope import BASE, RULES, WORLD, Rules, Scope, is_true
 from vkc_pin.utils.arrays import MAX_COORDINATE, MIN_POSITIVE
 from vkc_pin.utils.system import is_file
 from vkc_pin.world.files.documents import read_text
@@ -45,6 +46,8 @@ _DIAGONAL = ("ixx", "iyy", "izz")
 _MOVING = ("revolute", "continuous", "prismatic")
 _SIDES = 48  # facets of a cone
 _JOINT_TYPES = ("fixed", *_MOVING, "ball", "universal", "revolute2", "screw", "gearbox")
+# Elements of a <limit> and their defaults, by the specification; a rate of -1 means no limit
+_LIMITS = {"lower": "-1e16", "upper": "1e16", "velocity": "-1", "effort": "-1"}
 # Numbers of each shape: name of the element and count
 _SHAPES = {
     "box": (("size", 3),),
@@ -56,32 +59,30 @@ _SHAPES = {
 }
 
 
-def read_object_sdf(
-    file: Path, *, free: bool = False, packages: Mapping[str, Path] | None = None
-) -> Description:
-    """Read the description of an object or a home from an SDF file.
+def read_sdf_description(file: Path, packages: Mapping[str, Path]) -> Description:
+    """Read the description of a robot, an object or a home from an SDF file.
 
     The root's frame is the world. Models that are neither static nor connected to the world stay in
-    their places if they have joints, and are free otherwise.
+    their places if they have joints, and are free otherwise, on floating joints.
 
     Args:
         file: The file, with one model or one world.
-        free: Whether to keep free models, on floating joints; otherwise those beside others are
-            left out.
         packages: Folders of models by name; others are searched for around the file.
     """
     try:
-        return _Reader(file, packages or {}).read(free=free)
+        return _Reader(file, packages).read()
     except RecursionError:
         raise InputError("models or frames are nested too deeply", file=file) from None
 
 
 class _Reader:
     def __init__(self, file: Path, packages: Mapping[str, Path]) -> None:
-        self.file, self.packages, self.count = file, packages, 0
-        self.notes, self.missing = list[str](), list[MissingMesh]()
-        # Full name of the leader, factor and offset of each follower, by the follower's full name
-        self.followers = dict[str, tuple[str, float, float]]()
+        self.file = file
+        self.packages = packages
+        self.count = 0  # of models
+        self.notes = list[str]()
+        self.missing = list[MissingMesh]()
+        self.couplings = list[Coupling]()  # of joints by their full names
         root, rules = self._load(file)
         worlds, models = root.findall("world"), root.findall("model")
         if len(worlds) + len(models) != 1:
@@ -215,7 +216,8 @@ class _Reader:
             inner, files, (named.findtext("name") or named.get("name") or "").strip()
         )
 
-    def read(self, *, free: bool) -> Description:
+    def read(self) -> Description:
+        """Return the description; see `read_sdf_description`."""
         scopes = list(self.world.walk())
         links: dict[str, tuple[Scope, str]] = {}
         for scope in scopes:
@@ -261,17 +263,15 @@ class _Reader:
         is_connected = any(parent == BASE for _, _, parent in joints.values())
         above = {child: (parent, "") for child, (_, _, parent) in joints.items()}
         roots = find_roots(self.file, {**lines, **({BASE: None} if is_connected else {})}, above)
-        return self._describe(links, joints, roots, free=free)
+        return self._describe(links, joints, roots)
 
     def _describe(
         self,
         links: Mapping[str, tuple[Scope, str]],
         joints: Mapping[str, tuple[Scope, ElementTree.Element, str]],
         roots: Mapping[str, str],
-        *,
-        free: bool,
     ) -> Description:
-        kinds = self._connect(links, joints, roots, free=free)
+        kinds = self._connect(links, joints, roots)
         names = self._choose_names(links, kinds)
         base = names[BASE]
         repeated = Counter(joint.get("name", "") for _, joint, _ in joints.values())
@@ -288,8 +288,6 @@ class _Reader:
         found_links = {base: Link(base)} if kinds or BASE in roots else {}
         found_joints = dict[str, Joint]()
         for name, (scope, local) in links.items():
-            if roots[name] != BASE and kinds.get(roots[name], "fixed") == "left out":
-                continue
             found_links[names[name]] = self._read_link(scope, local, names[name], frames[name])
             if name in joints:
                 holder, joint, parent = joints[name]
@@ -307,80 +305,54 @@ class _Reader:
                     child=names[name],
                     placement=frames[name],
                 )
-        children = {
-            holder.path + joint.get("name", ""): names[child]
+        labels = {
+            holder.path + joint.get("name", ""): found_joints[names[child]].name
             for child, (holder, joint, _) in joints.items()
-            if names[child] in found_joints
         }
-        self._limit_followers(found_joints, children)
-        notes, missing = tuple(self.notes), tuple(self.missing)
-        return Description(self.file, found_links, found_joints, notes, missing)
-
-    def _limit_followers(self, joints: dict[str, Joint], children: Mapping[str, str]) -> None:
-        """Restrict followers to what their leaders' limits let them reach, leaders first.
-
-        Those in a circle keep their limits.
-
-        Args:
-            joints: Joints by their child, which are updated.
-            children: Child of each joint, by the full name of the joint.
-        """
-        left = {name: mimic for name, mimic in self.followers.items() if name in children}
-        while ready := [name for name, (leader, _, _) in left.items() if leader not in left]:
-            for name in ready:
-                leader, factor, offset = left.pop(name)
-                if leader not in children or not factor:
-                    continue
-                joint = joints[children[name]]
-                led_by = joints[children[leader]].limits
-                limits = limit_follower(joint.limits, led_by, factor, offset)
-                if joint.kind in ("revolute", "prismatic") and limits != joint.limits:
-                    joints[children[name]] = dataclasses.replace(joint, limits=limits)
+        couplings = list[Coupling]()
+        for coupling in self.couplings:
+            leader = labels.get(coupling.leader or "", coupling.leader)
+            couplings.append(
+                dataclasses.replace(coupling, joint=labels[coupling.joint], leader=leader)
+            )
+        return Description(
+            self.file,
+            found_links,
+            found_joints,
+            notes=tuple(self.notes),
+            missing=tuple(self.missing),
+            format="SDF",
+            couplings=tuple(couplings),
+            is_world=base in found_links,
+        )
 
     def _connect(
         self,
         links: Mapping[str, tuple[Scope, str]],
         joints: Mapping[str, tuple[Scope, ElementTree.Element, str]],
         roots: Mapping[str, str],
-        *,
-        free: bool,
     ) -> dict[str, str]:
         """Return how each root that no joint connects is held in the world.
 
-        Values are "fixed", "floating" and "left out". If the only root is to be the description's,
-        there are none.
+        Values are "fixed" and "floating". If the only root is to be the description's, there are
+        none.
         """
         loose = [name for name in dict.fromkeys(roots.values()) if name != BASE]
         is_connected = BASE in roots
+        if not self.is_world and len(loose) + is_connected == 1:
+            return {}
         static = {roots[link] for link, (scope, _) in links.items() if scope.is_static}
         moving = {
             roots[child]
             for child, (scope, joint, _) in joints.items()
             if self._read_kind(scope, joint) in _MOVING
         }
-        if not self.is_world and not free:
-            if len(loose) + is_connected == 1:
-                return {}
-            if not static.issuperset(loose):
-                raise InputError(
-                    "the links do not form one tree",
-                    file=self.file,
-                    field="model",
-                    expected="one tree",
-                    got=", ".join([*loose, *([WORLD] if is_connected else [])]),
-                )
-        other = "floating" if free else "left out"
-        kinds = {name: "fixed" if name in static | moving else other for name in loose}
-        for chosen, about in (
-            (moving - static, "not static, but with joints, hence fixed in place"),
-            ({name for name in kinds if kinds[name] == "left out"}, "free, hence left out"),
-        ):
-            labels = [
-                links[name][0].path.removesuffix("::") or name for name in loose if name in chosen
-            ]
-            if labels:
-                self.notes.append(f"{about}: {', '.join(labels)}")
-        return kinds
+        fixed = [name for name in loose if name in moving - static]
+        if fixed:
+            labels = [links[name][0].path.removesuffix("::") or name for name in fixed]
+            about = "not static, but with joints, hence fixed in place"
+            self.notes.append(f"{about}: {', '.join(labels)}")
+        return {name: "fixed" if name in static | moving else "floating" for name in loose}
 
     def _choose_names(
         self, links: Mapping[str, tuple[Scope, str]], kinds: Mapping[str, str]
@@ -426,18 +398,12 @@ class _Reader:
         element = joint.find("axis")
         if element is not None and kind != "fixed":
             axis = self._read_axis(scope, joint, element)
-            limits, settings["velocity"] = self._read_limits(scope, element, name)
+            limits, velocity, effort = self._read_limits(scope, element, name)
+            settings |= {"velocity": velocity, "effort": effort}
             settings |= self._read_dynamics(scope, element, name)
             mimic = element.find("mimic")
             if mimic is not None:
-                self.notes.append(f"joint '{name}' mimics another one: made independent")
-                factor, offset, reference = (
-                    scope.read_numbers(mimic, key, 1, default, name)[0]
-                    for key, default in (("multiplier", "1"), ("offset", "0"), ("reference", "0"))
-                )
-                leader = scope.path + mimic.get("joint", "").strip()
-                own = scope.path + joint.get("name", "")
-                self.followers[own] = (leader, factor, offset - factor * reference)
+                self.couplings.append(self._read_mimic(scope, joint, mimic))
         return Joint(
             name=name,
             kind=kind,
@@ -448,6 +414,18 @@ class _Reader:
             limits=None if kind == "continuous" else limits,
             **settings,
         )
+
+    def _read_mimic(
+        self, scope: Scope, joint: ElementTree.Element, mimic: ElementTree.Element
+    ) -> Coupling:
+        """Return the coupling y = factor · (x − reference) + offset of a joint, by full names."""
+        name = joint.get("name", "")
+        (factor,) = scope.read_numbers(mimic, "multiplier", 1, "1", name)
+        (offset,) = scope.read_numbers(mimic, "offset", 1, "0", name)
+        (reference,) = scope.read_numbers(mimic, "reference", 1, "0", name)
+        leader = scope.path + mimic.get("joint", "").strip()
+        coefficients = (offset - factor * reference, factor)
+        return Coupling(scope.path + name, leader, coefficients, "<mimic>")
 
     def _read_axis(
         self, scope: Scope, joint: ElementTree.Element, element: ElementTree.Element
@@ -475,13 +453,14 @@ class _Reader:
 
     def _read_limits(
         self, scope: Scope, element: ElementTree.Element, name: str
-    ) -> tuple[tuple[float, float] | None, float | None]:
-        """Return the position limits and the velocity limit of an axis."""
-        if (limit := element.find("limit")) is None:
-            return None, None
-        low, high, velocity = (
+    ) -> tuple[Limits, float | None, float | None]:
+        """Return the position, velocity and effort limits of an axis."""
+        limit = element.find("limit")
+        if limit is None:
+            return make_limits(-math.inf, math.inf), None, None
+        low, high, velocity, effort = (
             scope.read_numbers(limit, key, 1, default, name, largest=math.inf, is_finite=False)[0]
-            for key, default in (("lower", "-1e16"), ("upper", "1e16"), ("velocity", "-1"))
+            for key, default in _LIMITS.items()
         )
         if low > high:
             ends = f"{low:g} and {high:g}"
@@ -489,9 +468,10 @@ class _Reader:
                 f"joint '{name}' has a lower limit above its upper limit, {ends}: swapped"
             )
             low, high = high, low
-        return make_limits(
-            low, high
-        ), velocity if MIN_POSITIVE <= velocity < MAX_COORDINATE else None
+        rates = [
+            rate if MIN_POSITIVE <= rate < MAX_COORDINATE else None for rate in (velocity, effort)
+        ]
+        return make_limits(low, high), rates[0], rates[1]
 
     def _read_dynamics(
         self, scope: Scope, element: ElementTree.Element, name: str

@@ -8,8 +8,9 @@ from helpers.texts import format_box, format_fixed_link
 
 from vkc_pin.errors import InputError
 from vkc_pin.importing import import_home, import_object
-from vkc_pin.importing.missing_meshes import replace_missing_meshes
-from vkc_pin.importing.objects.urdf import read_object_urdf
+from vkc_pin.importing.formats.missing_meshes import replace_missing_meshes
+from vkc_pin.importing.objects.object_reading import read_object
+from vkc_pin.importing.robots.sources import Source, read_source
 from vkc_pin.world.files.urdf import UrdfFile, read_urdf
 
 BOX, VISUAL_BOX = format_box("1 1 1"), format_box("1 1 1", kind="visual")
@@ -26,6 +27,12 @@ def write_robot(folder: Path, *shapes: str) -> UrdfFile:
         links += format_fixed_link(f"l{k}", "l0", shapes=text)
     (folder / "r.urdf").write_text(f'<robot name="r">{links}</robot>')
     return read_urdf(folder / "r.urdf")
+
+
+def read_written(folder: Path, *shapes: str) -> Source:
+    """Write a URDF and read it as a robot."""
+    write_robot(folder, *shapes)
+    return read_source(folder / "r.urdf", folder / "scratch", packages={}, arguments={})
 
 
 @pytest.mark.parametrize(
@@ -56,11 +63,12 @@ def test_missing_meshes_are_replaced(
     tmp_path: Path, shapes: str, note: str, kinds: list[str]
 ) -> None:
     file = write_robot(tmp_path, shapes)
-    notes = replace_missing_meshes(file, every_link=True)
+    notes, missing = replace_missing_meshes(file)
+    assert not missing
     assert note in "; ".join(notes)
     assert [shape.kind for shape in file.read_shapes("collision")] == kinds
     file.read_shapes("visual")
-    description = read_object_urdf(tmp_path / "r.urdf")
+    description = read_object(tmp_path / "r.urdf")
     assert note in "; ".join(description.notes)
     assert [part.kind for part in description.links["l0"].solid] == kinds
 
@@ -68,17 +76,16 @@ def test_missing_meshes_are_replaced(
 def test_all_missing_meshes_are_listed(tmp_path: Path) -> None:
     shapes = [COLLISION.format(name) for name in ("a.stl", "there.stl", "package://p/b.dae")]
     with pytest.raises(InputError, match=r"2 meshes do not exist: a\.stl, package://p/b\.dae"):
-        replace_missing_meshes(write_robot(tmp_path, *shapes), every_link=True)
+        read_written(tmp_path, *shapes)
     with pytest.raises(InputError, match=r"a\.stl: there is no such mesh"):
-        replace_missing_meshes(write_robot(tmp_path, *shapes[:2]), every_link=True)
+        read_written(tmp_path, *shapes[:2])
 
 
 @pytest.mark.parametrize("address", ["{}.stl", "package://{}/a.stl", "model://p/{}"])
 def test_meshes_with_impossible_file_names_are_missing(tmp_path: Path, address: str) -> None:
     for name in ("é" * 300, "a/" * 3000, "%00"):
-        file = write_robot(tmp_path, COLLISION.format(address.format(name)))
         with pytest.raises(InputError, match="there is no such mesh") as caught:
-            replace_missing_meshes(file, every_link=True)
+            read_written(tmp_path, COLLISION.format(address.format(name)))
         assert caught.value.file == tmp_path / "r.urdf"
 
 
@@ -159,7 +166,10 @@ def test_meshes_that_are_missing_elsewhere_in_sdf_files_do_not_stop_an_import(
 def test_missing_visual_meshes_that_collide_are_errors(tmp_path: Path) -> None:
     """Visual shapes collide per link in objects, but in robots only without collision shapes."""
     cosmetic = (BOX, VISUAL.format("gone.stl"))
-    assert len(replace_missing_meshes(write_robot(tmp_path, *cosmetic), every_link=False)) == 1
-    for shapes, every_link in ((cosmetic, True), (cosmetic[1:], False)):
-        with pytest.raises(InputError, match=r"gone\.stl"):
-            replace_missing_meshes(write_robot(tmp_path, *shapes), every_link=every_link)
+    (warning,) = read_written(tmp_path, *cosmetic).warnings
+    assert warning == "l1: there is no visual mesh gone.stl: left out"
+    with pytest.raises(InputError, match=r"gone\.stl"):
+        read_written(tmp_path, *cosmetic[1:])
+    write_robot(tmp_path, *cosmetic)
+    with pytest.raises(InputError, match=r"gone\.stl"):
+        read_object(tmp_path / "r.urdf").check_meshes()

@@ -1,9 +1,9 @@
-"""Defines the description of an object, independent of its file format."""
+"""Defines the description of a robot, an object or a home, independent of its file format."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,8 +12,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.errors import InputError
-from vkc_pin.importing.missing_meshes import MissingMesh, make_missing_error
+from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.utils.arrays import MAX_COORDINATE, Floats
 from vkc_pin.world.files.meshes import load_mesh
 
@@ -22,9 +21,7 @@ if TYPE_CHECKING:
 
 
 Colour = tuple[float, float, float, float]
-WEIGHTLESS = (
-    "no mass is stated: arm torques ignore weight and inertia, and simulation assumes a density"
-)
+Limits = tuple[float, float]
 _RESISTANCES = ("damping", "friction", "stiffness")
 _SIDES = 48  # facets of a cylinder mesh
 SOLIDS = {
@@ -57,6 +54,10 @@ class Part:
     file: Path | None = None
     triangles: trimesh.Trimesh | None = None
     colour: Colour | None = None
+
+    def transform(self, placement: pin.SE3) -> Part:
+        """Return the shape in a frame in which its link's frame is at `placement`."""
+        return replace(self, placement=placement * self.placement)
 
     def make_mesh(self) -> trimesh.Trimesh:
         """Return the surface in the frame of its link [m]."""
@@ -108,10 +109,8 @@ class Link:
 
     def transform(self, placement: pin.SE3) -> Link:
         """Return the link in a frame in which its own frame is at `placement`."""
-        visual, collision = (
-            tuple(replace(part, placement=placement * part.placement) for part in kind)
-            for kind in (self.visual, self.collision)
-        )
+        visual = tuple(part.transform(placement) for part in self.visual)
+        collision = tuple(part.transform(placement) for part in self.collision)
         return Link(self.name, visual, collision, placement.act(self.inertia))
 
 
@@ -121,18 +120,20 @@ class Joint:
 
     Attributes:
         name: Joint name.
-        kind: "fixed", "revolute", "prismatic" or, if the file says that it turns without end,
-            "continuous"; in homes also "floating".
+        kind: "fixed", "revolute", "prismatic", "continuous" if the file says that it turns without
+            end, "floating" or "planar".
         parent, child: Names of the links.
         placement: Placement of the child's frame in the parent's.
         axis: Unit axis in the child's frame, shape (3,).
-        limits: Lower and upper limit, [rad] or [m], one of them infinite if the file states only
-            the other; None if the file states none.
+        limits: Lower and upper limit, [rad] or [m], infinite where the file says that there is
+            none; None if the file says nothing.
         velocity: Velocity limit, [rad/s] or [m/s]; None if the file states none.
+        effort: Effort limit, [N·m] or [N]; None if the file states none.
         damping: Damping, [N·m·s/rad] or [N·s/m]; 0 if the file states none.
         friction: Coulomb friction, [N·m] or [N]; 0 if the file states none.
         stiffness: Stiffness of a spring, [N·m/rad] or [N/m]; 0 if the file states none.
         springref: Rest position of the spring, [rad] or [m].
+        is_driven: Whether the file has an actuator for it.
     """
 
     name: str
@@ -141,12 +142,14 @@ class Joint:
     child: str
     placement: pin.SE3
     axis: Floats = field(default_factory=lambda: np.array([1.0, 0.0, 0.0]))
-    limits: tuple[float, float] | None = None
+    limits: Limits | None = None
     velocity: float | None = None
+    effort: float | None = None
     damping: float = 0.0
     friction: float = 0.0
     stiffness: float = 0.0
     springref: float = 0.0
+    is_driven: bool = False
 
     def compute_motion(self, value: float) -> pin.SE3:
         """Return the child's frame at a position, [rad] or [m], in its frame at zero."""
@@ -160,9 +163,77 @@ class Joint:
         return replace(self, kind="fixed", placement=placement, limits=None)
 
 
+@dataclass(frozen=True)
+class Coupling:
+    """A joint whose position y is a polynomial of its leader's position x: y = Σ aₖ xᵏ.
+
+    Attributes:
+        joint: Name of the joint that follows.
+        leader: Name of the leader; None if the joint is held at a₀.
+        coefficients: a₀, a₁, ...; [m] or [rad] for y and x.
+        element: Element of the file that states it, for messages.
+    """
+
+    joint: str
+    leader: str | None
+    coefficients: tuple[float, ...]
+    element: str
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether no power of x above the first counts."""
+        return not any(self.coefficients[2:])
+
+    @property
+    def offset(self) -> float:
+        """a₀ [m] or [rad]."""
+        return self.coefficients[0]
+
+    @property
+    def factor(self) -> float:
+        """a₁."""
+        return self.coefficients[1]
+
+    def evaluate(self, position: float) -> float:
+        """Return the joint's position, given its leader's, [m] or [rad]."""
+        return float(np.polynomial.polynomial.polyval(position, self.coefficients))
+
+
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """A connection of two links beside the tree of joints.
+
+    Attributes:
+        kind: "connected" at a point, or "welded".
+        links: Names of both links.
+        points: The point in the frame of each link [m], shape (3,) each; None for a weld.
+        element: Element of the file that states it, for messages.
+    """
+
+    kind: str
+    links: tuple[str, str]
+    points: tuple[Floats, Floats] | None
+    element: str
+
+
+@dataclass(frozen=True)
+class MissingMesh:
+    """A mesh that would collide, does not exist, and that nothing replaces.
+
+    Attributes:
+        link: Its link.
+        kind: "collision", or "visual" if the link has no collision shapes.
+        error: The error, whose `field` is the mesh's address.
+    """
+
+    link: str
+    kind: str
+    error: InputError
+
+
 @dataclass(frozen=True, eq=False)
 class Description:
-    """Description of an object as a tree of links.
+    """Description of a robot, an object or a home as a tree of links.
 
     Attributes:
         file: The file.
@@ -170,6 +241,12 @@ class Description:
         joints: Joints by the name of their child link.
         notes: Changes and omissions.
         missing: Meshes that would collide and do not exist.
+        format: Name of the file's format.
+        couplings: Joints that follow others or are held.
+        loops: Connections beside the tree of joints.
+        states: Joint positions by joint name, [rad] or [m], by the name of the state.
+        warnings: Changes that can make shapes wrong.
+        is_world: Whether the root is the world around the file's bodies.
     """
 
     file: Path
@@ -177,6 +254,12 @@ class Description:
     joints: Mapping[str, Joint]
     notes: tuple[str, ...] = ()
     missing: tuple[MissingMesh, ...] = ()
+    format: str = ""
+    couplings: tuple[Coupling, ...] = ()
+    loops: tuple[Loop, ...] = ()
+    states: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    is_world: bool = False
 
     @property
     def root(self) -> str:
@@ -189,17 +272,29 @@ class Description:
         Args:
             values: Joint positions by name, [rad] or [m]; others are at zero.
         """
+        positions = values or {}
         placements = {self.root: pin.SE3.Identity()}
-        before = 0
-        while before < len(placements):
-            before = len(placements)
-            for child, joint in self.joints.items():
-                if child not in placements and joint.parent in placements:
-                    value = (values or {}).get(joint.name, 0.0)
-                    placements[child] = (
-                        placements[joint.parent] * joint.placement * joint.compute_motion(value)
-                    )
+        children = self.children()
+        ahead = [self.root]
+        while ahead:
+            parent = ahead.pop()
+            for child in children.get(parent, ()):
+                joint = self.joints[child]
+                motion = joint.compute_motion(positions.get(joint.name, 0.0))
+                placements[child] = placements[parent] * joint.placement * motion
+                ahead.append(child)
         return placements
+
+    def find_joint(self, name: str) -> Joint:
+        """Return the joint of a name."""
+        return next(joint for joint in self.joints.values() if joint.name == name)
+
+    def walk_up(self, link: str) -> Iterator[str]:
+        """Yield a link and those that carry it, up to the root."""
+        yield link
+        while link in self.joints:
+            link = self.joints[link].parent
+            yield link
 
     @property
     def is_massless(self) -> bool:
@@ -212,7 +307,8 @@ class Description:
         Larger ones, also infinite ones, state that a joint does not move. Negative ones would
         drive it.
         """
-        joints, notes = dict(self.joints), list(self.notes)
+        joints = dict(self.joints)
+        notes = list(self.notes)
         for child, joint in self.joints.items():
             clipped = dict[str, Any]()
             for name in _RESISTANCES:
@@ -225,6 +321,92 @@ class Description:
             joints[child] = replace(joint, **clipped)
         return replace(self, joints=joints, notes=tuple(notes))
 
+    def extract_subtree(self, link: str) -> Description:
+        """Return a link and its descendants as a description of their own.
+
+        Raises:
+            UnknownNameError: There is no such link.
+        """
+        if link not in self.links:
+            raise UnknownNameError("link", link, self.links, file=self.file, field="link")
+        subtree = self.subtree(link)
+        links = {name: item for name, item in self.links.items() if name in subtree}
+        joints = {
+            child: joint
+            for child, joint in self.joints.items()
+            if child in subtree and child != link
+        }
+        return self.keep(links, joints)
+
+    def keep(self, links: Mapping[str, Link], joints: Mapping[str, Joint]) -> Description:
+        """Return the description with some of its links and joints, and what belongs to them."""
+        names = {joint.name for joint in joints.values()}
+        couplings = [
+            coupling
+            for coupling in self.couplings
+            if coupling.joint in names and (coupling.leader is None or coupling.leader in names)
+        ]
+        loops = [loop for loop in self.loops if set(loop.links) <= links.keys()]
+        states = {
+            name: {joint: value for joint, value in state.items() if joint in names}
+            for name, state in self.states.items()
+        }
+        return replace(
+            self,
+            links=links,
+            joints=joints,
+            missing=tuple(mesh for mesh in self.missing if mesh.link in links),
+            couplings=tuple(couplings),
+            loops=tuple(loops),
+            states=states,
+        )
+
+    def rename(self, links: Mapping[str, str], joints: Mapping[str, str]) -> Description:
+        """Return the description with other names.
+
+        Args:
+            links: New name of each link.
+            joints: New name of each joint, by its child link.
+        """
+        renamed_links = {
+            links[name]: replace(link, name=links[name]) for name, link in self.links.items()
+        }
+        renamed_joints = dict[str, Joint]()
+        new_names = dict[str, str]()
+        for child, joint in self.joints.items():
+            new_names[joint.name] = joints[child]
+            renamed_joints[links[child]] = replace(
+                joint, name=joints[child], parent=links[joint.parent], child=links[child]
+            )
+        couplings = [
+            replace(
+                coupling,
+                joint=new_names[coupling.joint],
+                leader=new_names.get(coupling.leader or "", coupling.leader),
+            )
+            for coupling in self.couplings
+        ]
+        loops = [
+            replace(loop, links=(links[loop.links[0]], links[loop.links[1]])) for loop in self.loops
+        ]
+        states = {
+            name: {new_names[joint]: value for joint, value in state.items()}
+            for name, state in self.states.items()
+        }
+        return replace(
+            self,
+            links=renamed_links,
+            joints=renamed_joints,
+            missing=tuple(replace(mesh, link=links[mesh.link]) for mesh in self.missing),
+            couplings=tuple(couplings),
+            loops=tuple(loops),
+            states=states,
+        )
+
+    def add_notes(self, *notes: str) -> Description:
+        """Return the description with more notes."""
+        return replace(self, notes=(*self.notes, *notes))
+
     def check_meshes(self, *, is_home: bool = False) -> Description:
         """Return the object after checking that no mesh of its links is missing.
 
@@ -234,21 +416,19 @@ class Description:
         Raises:
             InputError: A mesh is missing.
         """
-        of_links = [mesh for mesh in self.missing if mesh.link in self.links]
-        omitted = [
-            mesh
-            for mesh in of_links
-            if is_home and mesh.kind == "visual" and self.is_fixed(mesh.link)
-        ]
-        errors = [mesh.error for mesh in of_links if mesh not in omitted]
+        errors = list[InputError]()
+        notes = list[str]()
+        for mesh in self.missing:
+            if mesh.link not in self.links:
+                continue
+            if is_home and mesh.kind == "visual" and self.is_fixed(mesh.link):
+                lacks = f"link '{mesh.link}': there is no visual mesh {mesh.error.field}"
+                notes.append(f"{lacks}: left out, although nothing collides in its place")
+            else:
+                errors.append(mesh.error)
         if errors:
             raise make_missing_error(errors, self.file)
-        notes = [
-            f"link '{mesh.link}': there is no visual mesh {mesh.error.field}: left out, "
-            "although nothing collides in its place"
-            for mesh in omitted
-        ]
-        return replace(self, notes=(*self.notes, *notes), missing=())
+        return replace(self.add_notes(*notes), missing=())
 
     def is_fixed(self, link: str) -> bool:
         """Return whether only fixed joints connect a link with the root."""
@@ -276,32 +456,29 @@ class Description:
         return found
 
 
-def make_limits(low: float, high: float) -> tuple[float, float] | None:
+def make_missing_error(errors: Sequence[InputError], file: Path) -> InputError:
+    """Return one error about all missing meshes of a file.
+
+    Args:
+        errors: Errors about single meshes, whose `field` is the mesh's address.
+        file: The file.
+    """
+    by_address = {str(error.field): error for error in errors}
+    if len(by_address) == 1:
+        return errors[0]
+    return InputError(
+        f"{len(by_address)} meshes do not exist: {', '.join(by_address)}",
+        file=file,
+        expected="mesh files, or visual shapes of the same links",
+        got=errors[0].got,
+    )
+
+
+def make_limits(low: float, high: float) -> Limits:
     """Return the limits of a joint as in `Joint`; numbers beyond `MAX_COORDINATE` mean none."""
     low = low if low > -MAX_COORDINATE else -math.inf
     high = high if high < MAX_COORDINATE else math.inf
-    return None if math.isinf(low) and math.isinf(high) else (low, high)
-
-
-def limit_follower(
-    own: tuple[float, float] | None,
-    leader: tuple[float, float] | None,
-    factor: float,
-    offset: float,
-) -> tuple[float, float] | None:
-    """Return the limits of a joint whose position is factor · leader's position + offset.
-
-    Its own limits count where its leader reaches them: they may be a copy of the leader's, with
-    which the follower of a negative factor could not move.
-    """
-    if leader is None:
-        return own
-    ends = sorted(factor * end + offset for end in leader)
-    reached = (ends[0], ends[1])
-    if own is None:
-        return reached
-    common = (max(own[0], reached[0]), min(own[1], reached[1]))
-    return common if common[0] < common[1] else reached
+    return (low, high)
 
 
 def make_inertia(mass: float, moments: Iterable[float], placement: pin.SE3) -> pin.Inertia:

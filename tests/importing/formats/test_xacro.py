@@ -20,7 +20,7 @@ import trimesh
 
 from vkc_pin.errors import InputError
 from vkc_pin.importing import import_home, import_object, import_robot
-from vkc_pin.importing.mjcf_models import NO_MASS, compile_mjcf
+from vkc_pin.importing.formats.mjcf_compiler import NO_MASS, compile_mjcf
 from vkc_pin.importing.robots.sources import read_source
 from vkc_pin.utils.isolation import TIME_VARIABLE
 from vkc_pin.world.files.meshes import load_mesh, load_parts

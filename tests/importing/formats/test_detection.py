@@ -191,14 +191,18 @@ def test_empty_files_are_rejected(
 
 
 @pytest.mark.parametrize("name", ["free.sdf", "free.xml"])
-def test_files_of_free_bodies_alone_say_what_was_left_out(name: str, tmp_path: Path) -> None:
+def test_one_free_body_is_the_object_and_several_are_left_out(name: str, tmp_path: Path) -> None:
     shape = '<collision name="c"><geometry><box><size>1 1 1</size></box></geometry></collision>'
-    texts = {
-        "free.sdf": f'<sdf version="1.9"><world name="w"><model name="can"><link name="a">{shape}'
-        "</link></model></world></sdf>",
-        "free.xml": '<mujoco><worldbody><body name="can"><freejoint/><geom size="1"/></body>'
-        "</worldbody></mujoco>",
-    }
-    (tmp_path / name).write_text(texts[name])
-    with pytest.raises(vkc.InputError, match=r"no shapes are left .*can.*left out|left out: can"):
-        vkc.importing.import_object(tmp_path / name, tmp_path / "out")
+    model = f'<model name="{{}}"><link name="a">{shape}</link></model>'
+    body = '<body name="{}"><freejoint/><geom type="box" size="0.5 0.5 0.5"/></body>'
+    start, each, end = {
+        "free.sdf": ('<sdf version="1.9"><world name="w">', model, "</world></sdf>"),
+        "free.xml": ("<mujoco><worldbody>", body, "</worldbody></mujoco>"),
+    }[name]
+    file = tmp_path / name
+    file.write_text(start + each.format("can") + end)
+    can = vkc.importing.import_object(file, tmp_path / "can")
+    assert can.size == pytest.approx([1.0, 1.0, 1.0])
+    file.write_text(start + each.format("can") + each.format("cup") + end)
+    with pytest.raises(vkc.InputError, match=r"no shapes are left .*'can' is free.*'cup' is free"):
+        vkc.importing.import_object(file, tmp_path / "out")

@@ -10,6 +10,8 @@ from typing import Any
 
 _MAX_VALUE_LENGTH = 300  # characters of a value in a message
 _MAX_NAME_LENGTH = 80
+_MAX_MESSAGE_LENGTH = 6 * _MAX_VALUE_LENGTH  # without the expected and the given value
+_MAX_LISTED_CHOICES = 12
 
 
 class _ShortRepr(reprlib.Repr):
@@ -17,7 +19,8 @@ class _ShortRepr(reprlib.Repr):
         return repr(float(x))  # NumPy's numbers as Python's
 
     def repr_int(self, x: int, level: int) -> str:
-        bits = x.bit_length()  # Python refuses to write out very large ones
+        # Python refuses to write out very large integers.
+        bits = x.bit_length()
         return repr(x) if bits <= 256 else f"an integer of {bits} bits"
 
 
@@ -27,7 +30,8 @@ _SHORT_REPR.maxtuple = 12
 _SHORT_REPR.maxlist = 12
 _SHORT_REPR.maxdict = 8
 _SHORT_REPR.maxset = 8
-_SHORT_REPR.maxstring = _SHORT_REPR.maxother = 200
+_SHORT_REPR.maxstring = 200
+_SHORT_REPR.maxother = 200
 
 
 def format_value(value: object) -> str:
@@ -35,19 +39,27 @@ def format_value(value: object) -> str:
     return _SHORT_REPR.repr(value)
 
 
-def _shorten(text: str, most: int = _MAX_VALUE_LENGTH) -> str:
-    return text if len(text) <= most else f"{text[: most - 43]}...{text[-40:]}"
+def _shorten(text: str, max_length: int = _MAX_VALUE_LENGTH) -> str:
+    """Return the start and the last 40 characters of a text that is longer than `max_length`."""
+    if len(text) <= max_length:
+        return text
+    start = text[: max_length - 43]
+    end = text[-40:]
+    return f"{start}...{end}"
 
 
 def _escape(text: str) -> str:
-    """Replace what terminals would execute or cannot print by Python's escapes."""
-    return "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in text)
+    """Replace characters that terminals would execute or cannot print by Python's escapes."""
+    letters = list[str]()
+    for letter in text:
+        letters.append(letter if letter.isprintable() else ascii(letter)[1:-1])
+    return "".join(letters)
 
 
 def _format_detail(value: object) -> str:
-    if isinstance(value, float | Path):
+    if isinstance(value, str | float | Path):
         return _shorten(str(value))
-    return _shorten(value if isinstance(value, str) else format_value(value))
+    return _shorten(format_value(value))
 
 
 def _shorten_name(name: str) -> str:
@@ -56,9 +68,9 @@ def _shorten_name(name: str) -> str:
 
 def find_nearest_name(name: str, choices: Iterable[str]) -> str | None:
     """Return the choice most similar to `name`, or None if none is similar."""
-    matches = difflib.get_close_matches(
-        _shorten(name, _MAX_NAME_LENGTH), [str(c) for c in choices], n=1, cutoff=0.5
-    )
+    short_name = _shorten(name, _MAX_NAME_LENGTH)
+    texts = [str(choice) for choice in choices]
+    matches = difflib.get_close_matches(short_name, texts, n=1, cutoff=0.5)
     return matches[0] if matches else None
 
 
@@ -67,11 +79,11 @@ class VkcError(Exception):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the attributes: by default, Python would call the class with the message."""
-        plain = str, int, float, bool, Path, type(None)
-        state = {
-            name: value if isinstance(value, plain) or name == "choices" else _format_detail(value)
-            for name, value in vars(self).items()
-        }
+        plain = (str, int, float, bool, Path, type(None))
+        state = dict(vars(self))
+        for name, value in vars(self).items():
+            if name != "choices" and not isinstance(value, plain):
+                state[name] = _format_detail(value)
         return _restore_error, (type(self), self.args, state)
 
 
@@ -107,20 +119,29 @@ class InputError(VkcError, ValueError):
         expected: object = None,
         got: object = None,
     ) -> None:
-        self.problem, self.file, self.line, self.field = problem, file, line, field
-        self.expected, self.got = expected, got
-        named = None if file is None else _escape(_shorten(str(file)))
-        where = "" if named is None else f"{named}:{line}: " if line is not None else f"{named}: "
-        what = problem if field is None else f"{_escape(_shorten(field))}: {problem}"
-        details = [
-            f"{label} {_format_detail(value)}"
-            for label, value in (("expected", expected), ("got", got))
-            if value is not None
-        ]
-        super().__init__(
-            _shorten(where + what, 6 * _MAX_VALUE_LENGTH)
-            + (f" ({', '.join(details)})" if details else "")
-        )
+        self.problem = problem
+        self.file = file
+        self.line = line
+        self.field = field
+        self.expected = expected
+        self.got = got
+        super().__init__(self._format())
+
+    def _format(self) -> str:
+        """Return the message: "file:line: field: problem (expected ..., got ...)"."""
+        text = ""
+        if self.file is not None:
+            text += _escape(_shorten(str(self.file)))
+            text += ": " if self.line is None else f":{self.line}: "
+        if self.field is not None:
+            text += f"{_escape(_shorten(self.field))}: "
+        text = _shorten(text + self.problem, _MAX_MESSAGE_LENGTH)
+        details = list[str]()
+        if self.expected is not None:
+            details.append(f"expected {_format_detail(self.expected)}")
+        if self.got is not None:
+            details.append(f"got {_format_detail(self.got)}")
+        return f"{text} ({', '.join(details)})" if details else text
 
 
 class UnknownNameError(InputError):
@@ -136,17 +157,17 @@ class UnknownNameError(InputError):
         line: int | None = None,
         field: str | None = None,
     ) -> None:
-        self.kind, self.name, self.choices = kind, name, tuple(str(c) for c in choices)
+        self.kind = kind
+        self.name = name
+        self.choices = tuple(str(choice) for choice in choices)
         self.nearest = find_nearest_name(name, self.choices)
-        listed = ", ".join(_shorten_name(choice) for choice in self.choices[:12]) + (
-            ", ..." if len(self.choices) > 12 else ""
-        )
-        hint = f"; did you mean '{_shorten_name(self.nearest)}'?" if self.nearest else ""
+        listed = [_shorten_name(choice) for choice in self.choices[:_MAX_LISTED_CHOICES]]
+        if len(self.choices) > _MAX_LISTED_CHOICES:
+            listed.append("...")
+        known = ", ".join(listed) or "none"
         problem = f"there is no {kind} '{_shorten_name(name)}'"
-        known = f"here are: {listed or 'none'}"
-        super().__init__(
-            f"{problem}{hint} T{known}" if hint else f"{problem}; t{known}",
-            file=file,
-            line=line,
-            field=field,
-        )
+        if self.nearest:
+            problem += f"; did you mean '{_shorten_name(self.nearest)}'? There are: {known}"
+        else:
+            problem += f"; there are: {known}"
+        super().__init__(problem, file=file, line=line, field=field)

@@ -10,7 +10,8 @@ from vkc_pin.utils.arguments import check_integer, check_number
 
 Objective = Literal["path_length", "control_effort"]
 OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
-_MIN, _MAX = 1e-9, 1e9
+_MIN = 1e-9
+_MAX = 1e9
 _RANGES = {
     "dt": (1e-3, 60.0),
     "grasp_time": (_MIN, 3600.0),
@@ -19,10 +20,16 @@ _RANGES = {
     "payload_factor": (_MIN, 1e3),
     "jerk_time": (0.005, 10.0),  # or 0; motions have a knot every 0.6 ms at the lower bound
 }
-_MAX_INTEGERS = {  # beyond these, planning takes hours and gigabytes
-    **dict.fromkeys(("reach_waypoints", "turn_waypoints", "move_waypoints"), 500),
-    **{"max_refinements": 4, "contact_slots": 64, "max_outer": 10_000},
-    **{"max_iterations": 100_000, "max_restarts": 1000},
+# Beyond these, planning takes hours and gigabytes.
+_MAX_INTEGERS = {
+    "reach_waypoints": 500,
+    "turn_waypoints": 500,
+    "move_waypoints": 500,
+    "max_refinements": 4,
+    "contact_slots": 64,
+    "max_outer": 10_000,
+    "max_iterations": 100_000,
+    "max_restarts": 1000,
 }
 
 
@@ -90,25 +97,15 @@ class Options:
 
     def __post_init__(self) -> None:
         for item in fields(self):
-            value, field = getattr(self, item.name), f"Options.{item.name}"
+            value: Any = getattr(self, item.name)
             if item.name == "objective":
-                if not isinstance(value, str) or value not in OBJECTIVES:
-                    expected = " or ".join(map(repr, OBJECTIVES))
-                    got = format_value(value)
-                    raise InputError("unknown", field=field, expected=expected, got=got)
-                value = str(value)
+                value = _check_objective(value)
             elif item.type == "int":
-                least = 0 if item.name == "max_refinements" else 1
-                value = check_integer(value, field, low=least, high=_MAX_INTEGERS[item.name])
+                value = _check_count(item.name, value)
             else:
-                low, high = _RANGES.get(item.name, (_MIN, _MAX))
-                has_zero = item.name == "jerk_time"
-                expected = f"a positive finite number, from {low:g} to {high:g}"
-                expected += ", or 0" if has_zero else ""
-                value = check_number(value, field, expected, low=0.0, high=high)
-                if not (low <= value or (has_zero and value == 0.0)):
-                    raise InputError("out of range", field=field, expected=expected, got=value)
-            object.__setattr__(self, item.name, value)  # JSON has no NumPy types
+                value = _check_quantity(item.name, value)
+            # The checked value has a type of Python: JSON has no NumPy types.
+            object.__setattr__(self, item.name, value)
 
     @classmethod
     def paper(cls, **changes: Any) -> Self:
@@ -117,10 +114,12 @@ class Options:
         Args:
             **changes: Other fields.
         """
-        weights = dict.fromkeys(
-            (item.name for item in fields(cls) if item.name.startswith("velocity_weight")), 1.0
-        )
-        return cls(**{"objective": "control_effort", **weights, **changes})
+        values: dict[str, Any] = {"objective": "control_effort"}
+        for item in fields(cls):
+            if item.name.startswith("velocity_weight"):
+                values[item.name] = 1.0
+        values.update(changes)
+        return cls(**values)
 
     @property
     def largest_margin(self) -> float:
@@ -130,3 +129,30 @@ class Options:
     def steps(self, seconds: float) -> int:
         """Return the number of steps of `dt` in a time [s], at least 1."""
         return max(1, round(seconds / self.dt))
+
+
+def _check_objective(value: Any) -> str:
+    if not isinstance(value, str) or value not in OBJECTIVES:
+        expected = " or ".join(map(repr, OBJECTIVES))
+        got = format_value(value)
+        raise InputError("unknown", field="Options.objective", expected=expected, got=got)
+    return str(value)
+
+
+def _check_count(name: str, value: Any) -> int:
+    least = 0 if name == "max_refinements" else 1
+    return check_integer(value, f"Options.{name}", low=least, high=_MAX_INTEGERS[name])
+
+
+def _check_quantity(name: str, value: Any) -> float:
+    field = f"Options.{name}"
+    low, high = _RANGES.get(name, (_MIN, _MAX))
+    expected = f"a positive finite number, from {low:g} to {high:g}"
+    may_be_zero = name == "jerk_time"
+    if may_be_zero:
+        expected += ", or 0"
+    number = check_number(value, field, expected, low=0.0, high=high)
+    is_valid = low <= number or (may_be_zero and number == 0.0)
+    if not is_valid:
+        raise InputError("out of range", field=field, expected=expected, got=number)
+    return number

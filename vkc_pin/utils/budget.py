@@ -45,11 +45,13 @@ class Budget:
     """
 
     def __init__(self, seconds: float | None = None, max_evaluations: int | None = None) -> None:
-        self._seconds, self._max_evaluations = seconds, max_evaluations
+        self._seconds = seconds
+        self._max_evaluations = max_evaluations
         deadline = math.inf if seconds is None else time.perf_counter() + seconds
-        self.limits = deadline, math.inf if max_evaluations is None else max_evaluations
+        self.limits = (deadline, math.inf if max_evaluations is None else max_evaluations)
         self.share: Callable[[], tuple[float, float]] | None = None
-        self.is_interrupted, self.evaluations = False, 0
+        self.is_interrupted = False
+        self.evaluations = 0
         self.reserved: dict[str, float] = {}
 
     @property
@@ -157,22 +159,24 @@ def share_budget(count: int | Callable[[], int]) -> Iterator[None]:
     if budget is None:
         yield
         return
-    limits, share = budget.limits, budget.share
-    start = budget.end_time, budget.evaluations
+    limits_before = budget.limits
+    share_before = budget.share
+    start_time = budget.end_time
+    start_evaluations = budget.evaluations
 
-    def divide() -> tuple[float, float]:
+    def compute_share() -> tuple[float, float]:
         number = count if isinstance(count, int) else count()
-        deadline, max_evaluations = (
-            first + max(0.0, last - first) / number
-            for first, last in zip(start, limits, strict=True)
-        )
-        return deadline, max_evaluations
+        deadline, max_evaluations = limits_before
+        seconds_left = max(0.0, deadline - start_time)
+        evaluations_left = max(0.0, max_evaluations - start_evaluations)
+        return start_time + seconds_left / number, start_evaluations + evaluations_left / number
 
-    budget.share = divide
+    budget.share = compute_share
     try:
         yield
     finally:
-        budget.limits, budget.share = limits, share
+        budget.limits = limits_before
+        budget.share = share_before
 
 
 def enforce_share() -> None:

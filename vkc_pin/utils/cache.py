@@ -46,9 +46,13 @@ class Cache:
     """
 
     def __init__(self, *, max_entries: int = 512, max_nbytes: float = 2.0**30) -> None:
-        self.max_entries, self.max_nbytes, self.build_time = max_entries, max_nbytes, 0.0
+        self.max_entries = max_entries
+        self.max_nbytes = max_nbytes
+        self.build_time = 0.0
         self._objects: OrderedDict[Hashable, Any] = OrderedDict()
-        self._hits = self._misses = self._depth = 0
+        self._hits = 0
+        self._misses = 0
+        self._depth = 0  # number of objects being built, each as a part of the one before
 
     def get(self, key: Hashable, build: Callable[[], T]) -> T:
         """Return the object of `key`, which is built if it is not cached.
@@ -65,12 +69,14 @@ class Cache:
         else:
             record_evaluations()
             self._misses += 1
-            began, self._depth = time.perf_counter(), self._depth + 1
+            began = time.perf_counter()
+            self._depth += 1
             try:
                 self._objects[key] = build()
             finally:
                 self._depth -= 1
-                if not self._depth:  # the time of the whole includes that of its parts
+                # The time of the whole includes that of its parts.
+                if self._depth == 0:
                     self.build_time += time.perf_counter() - began
         self._objects.move_to_end(key)
         value = cast(T, self._objects[key])
@@ -90,7 +96,8 @@ class Cache:
         if total <= self.max_nbytes:
             return
         while total > self.max_nbytes and len(self._objects) > 1:
-            total -= int(self._objects.popitem(last=False)[1].nbytes)
+            _, oldest = self._objects.popitem(last=False)
+            total -= int(oldest.nbytes)
         release_freed_memory()
 
     def info(self) -> CacheInfo:

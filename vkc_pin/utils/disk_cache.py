@@ -52,7 +52,8 @@ def _is_private_folder(path: Path) -> bool:
 
 def is_private(status: os.stat_result) -> bool:
     """Return whether a file belongs to this user, and no other user may write to it."""
-    return status.st_uid == os.geteuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    others_may_write = status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    return status.st_uid == os.geteuid() and not others_may_write
 
 
 def load_or_build(key: bytes, build: Callable[[], Any]) -> Any:
@@ -63,16 +64,17 @@ def load_or_build(key: bytes, build: Callable[[], Any]) -> Any:
         build: Returns the data: lists, dictionaries, text and numbers. They are restored exactly.
     """
     folder = find_cache_folder()
-    path = None if folder is None else folder / f"{hashlib.sha256(key).hexdigest()[:40]}.json"
-    if path is not None:
-        with contextlib.suppress(OSError, ValueError):
-            return _read_record(path)
+    if folder is None:
+        return build()
+    key_digest = hashlib.sha256(key).hexdigest()
+    path = folder / f"{key_digest[:40]}.json"
+    with contextlib.suppress(OSError, ValueError):
+        return _read_record(path)
     data = build()
-    if path is not None:
-        text = json.dumps(data)
-        digest = hashlib.sha256(text.encode()).hexdigest()
-        with contextlib.suppress(OSError):
-            write_private_file(path, f"{digest}\n{text}".encode())
+    text = json.dumps(data)
+    text_digest = hashlib.sha256(text.encode()).hexdigest()
+    with contextlib.suppress(OSError):
+        write_private_file(path, f"{text_digest}\n{text}".encode())
     return data
 
 
@@ -91,7 +93,8 @@ def write_private_file(path: Path, data: bytes) -> None:
 
 def _read_record(path: Path) -> Any:
     """Return a record. Raises OSError if it is missing or foreign, ValueError if it is damaged."""
-    with os.fdopen(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb") as stream:
+    handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    with os.fdopen(handle, "rb") as stream:
         status = os.fstat(stream.fileno())
         is_own_file = stat.S_ISREG(status.st_mode) and is_private(status)
         if not is_own_file or status.st_size > _MAX_RECORD_SIZE:

@@ -19,9 +19,10 @@ def handle_interrupt(
     Where Ctrl-C is ignored, as in background processes of scripts, it stays ignored.
     """
     before = signal.getsignal(signal.SIGINT)
-    # None: a program that embeds Python handles the signal, and could not be restored
-    is_kept = before in (None, signal.SIG_IGN)
-    if is_kept or threading.current_thread() is not threading.main_thread():
+    # None: a program that embeds Python handles the signal, and its handler could not be restored.
+    must_stay = before in (None, signal.SIG_IGN)
+    is_main_thread = threading.current_thread() is threading.main_thread()
+    if must_stay or not is_main_thread:
         yield before
         return
     signal.signal(signal.SIGINT, handler)
@@ -34,12 +35,17 @@ def handle_interrupt(
 @contextlib.contextmanager
 def defer_interrupt() -> Iterator[None]:
     """Defer Ctrl-C to the end of a short operation that must be complete."""
-    pressed: list[int] = []
+    is_pressed = False
+
+    def note(number: int, frame: FrameType | None) -> None:
+        nonlocal is_pressed
+        is_pressed = True
+
     try:
-        with handle_interrupt(lambda number, frame: pressed.append(number)):
+        with handle_interrupt(note):
             yield
     finally:
-        if pressed:
+        if is_pressed:
             signal.raise_signal(signal.SIGINT)
 
 

@@ -7,6 +7,7 @@ in an `InputError` and not in the death of the calling process.
 from __future__ import annotations
 
 import contextlib
+import functools
 import math
 import os
 import pickle
@@ -67,10 +68,11 @@ def submit_isolated(
         InputError: The program crashes or exceeds a limit.
     """
     if not has_python():
-        return lambda: function(*arguments)
-    child, seconds = _get_child(), _read_limit(TIME_VARIABLE)
+        return functools.partial(function, *arguments)
+    child = _get_child()
+    seconds = _read_limit(TIME_VARIABLE)
     child.submit((function, arguments, seconds))
-    return lambda: child.receive(program, file, seconds)
+    return functools.partial(child.receive, program, file, seconds)
 
 
 def has_python() -> bool:
@@ -84,15 +86,18 @@ class _Child:
     def __init__(self) -> None:
         self.owner = os.getpid()
         self._process: subprocess.Popen[bytes] | None = None
-        self._memory, self._is_busy = 0.0, False
+        self._memory = 0.0  # limit of the process [GB]
+        self._is_busy = False
 
     def submit(self, call: tuple[Any, ...]) -> None:
         memory = _read_limit(MEMORY_VARIABLE)
-        is_stopped = self._process is not None and self._process.poll() is not None  # by Ctrl-C
-        if self._is_busy or is_stopped or memory != self._memory:
-            self.close()  # if it is busy, with a call whose result nobody fetched
+        # A process ends at Ctrl-C, and is busy if nobody fetched the result of its last call.
+        is_ended = self._process is not None and self._process.poll() is not None
+        if self._is_busy or is_ended or memory != self._memory:
+            self.close()
         if self._process is None:
-            self._process, self._memory = _start_process(memory), memory
+            self._process = _start_process(memory)
+            self._memory = memory
             self._end = weakref.finalize(self, _end_process, self._process, self.owner)
         assert self._process.stdin is not None
         self._is_busy = True
@@ -121,16 +126,19 @@ class _Child:
     def close(self) -> None:
         if self._process is not None:
             self._end()
-        self._process, self._is_busy = None, False
+        self._process = None
+        self._is_busy = False
 
 
 _LOCAL = threading.local()
 
 
 def _get_child() -> _Child:
+    """Return the child process of this thread; a fork must not use that of its parent."""
     child: _Child | None = getattr(_LOCAL, "child", None)
-    if child is None or child.owner != os.getpid():  # a fork must not use its parent's
-        child = _LOCAL.child = _Child()
+    if child is None or child.owner != os.getpid():
+        child = _Child()
+        _LOCAL.child = child
     return child
 
 
@@ -144,14 +152,16 @@ def _end_process(process: subprocess.Popen[bytes], owner: int) -> None:
 def _start_process(memory: float) -> subprocess.Popen[bytes]:
     # -P: the current folder is no place to import from.
     command = [sys.executable, "-P", "-c", _SCRIPT, str(memory)]
+    command += map(os.path.abspath, sys.path)
+    environment = dict(os.environ)
+    environment["OPENBLAS_NUM_THREADS"] = "1"  # it reserves memory for each thread
     return subprocess.Popen(
-        [*command, *map(os.path.abspath, sys.path)],
+        command,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
         cwd="/",  # where programs cannot leave files such as MUJOCO_LOG.TXT
-        # OpenBLAS reserves memory for each thread.
-        env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+        env=environment,
     )
 
 
@@ -162,15 +172,15 @@ def _explain_end(
     if code == -signal.SIGINT:
         return KeyboardInterrupt()
     if code == -signal.SIGALRM:
-        problem, expected = "does not finish in time", f"{seconds:g} s ({TIME_VARIABLE})"
-    elif code in (-signal.SIGKILL, _OUT_OF_MEMORY):
-        problem, expected = "needs too much memory", f"{memory:g} GB ({MEMORY_VARIABLE})"
-    else:
-        got = f"exit code {code}"
-        with contextlib.suppress(ValueError):
-            got = signal.strsignal(-code) or got
-        return InputError(f"{program} crashes", file=file, expected="a valid file", got=got)
-    return InputError(f"{program} {problem}", file=file, expected=f"at most {expected}")
+        expected = f"at most {seconds:g} s ({TIME_VARIABLE})"
+        return InputError(f"{program} does not finish in time", file=file, expected=expected)
+    if code in (-signal.SIGKILL, _OUT_OF_MEMORY):
+        expected = f"at most {memory:g} GB ({MEMORY_VARIABLE})"
+        return InputError(f"{program} needs too much memory", file=file, expected=expected)
+    got = f"exit code {code}"
+    with contextlib.suppress(ValueError):
+        got = signal.strsignal(-code) or got
+    return InputError(f"{program} crashes", file=file, expected="a valid file", got=got)
 
 
 def _read_limit(name: str) -> float:
@@ -187,7 +197,9 @@ def _read_limit(name: str) -> float:
 
 def serve() -> None:
     """Answer the calls of the parent process until it closes standard input."""
-    answers, requests = os.fdopen(os.dup(1), "wb"), os.fdopen(os.dup(0), "rb")
+    # The parser may write to its standard streams, which therefore lead nowhere.
+    answers = os.fdopen(os.dup(1), "wb")
+    requests = os.fdopen(os.dup(0), "rb")
     null = os.open(os.devnull, os.O_RDWR)
     for stream in range(3):
         os.dup2(null, stream)

@@ -34,10 +34,11 @@ def find_processor_name() -> str:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
         return platform.processor()
-    return next(
-        (line.partition(":")[2].strip() for line in lines if line.startswith("model name")),
-        platform.processor(),
-    )
+    for line in lines:
+        if line.startswith("model name"):
+            _, _, name = line.partition(":")
+            return name.strip()
+    return platform.processor()
 
 
 def has_screen() -> bool:
@@ -56,7 +57,9 @@ def find_libc_version() -> str | None:
 def measure_peak_memory() -> float:
     """Return the largest memory use of this process so far [MB]."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (2**20 if sys.platform == "darwin" else 2**10)  # [bytes], and [KB] elsewhere
+    # macOS states bytes, other systems kilobytes.
+    per_megabyte = 2**20 if sys.platform == "darwin" else 2**10
+    return peak / per_megabyte
 
 
 def measure_resident_memory() -> float:

@@ -53,10 +53,12 @@ class WorldBoxes:
     def __init__(
         self, lower: Floats, upper: Floats, fixed_lower: Floats, fixed_upper: Floats
     ) -> None:
-        corners = (
-            np.ascontiguousarray(part, float) for part in (lower, upper, fixed_lower, fixed_upper)
+        self.compiled: Any = load_compiled().WorldBoxes(
+            np.ascontiguousarray(lower, float),
+            np.ascontiguousarray(upper, float),
+            np.ascontiguousarray(fixed_lower, float),
+            np.ascontiguousarray(fixed_upper, float),
         )
-        self.compiled: Any = load_compiled().WorldBoxes(*corners)
 
     def find_close_pairs(
         self,
@@ -87,13 +89,14 @@ class WorldBoxes:
         Returns:
             Indices of interval and pair, shape (C,) each, sorted by interval, then by pair.
         """
-        numbers = (
-            np.ascontiguousarray(part, np.int64)
-            for part in (np.column_stack([first, last]), phases)
-        )
+        ends = np.column_stack([first, last])
         flags = np.ascontiguousarray(moves).view(np.uint8)
-        rows = np.ascontiguousarray(pairs, np.int64)
-        intervals, which = self.compiled.near(
-            *numbers, flags, rows, np.ascontiguousarray(moved, float), limit
+        interval_indices, pair_indices = self.compiled.near(
+            np.ascontiguousarray(ends, np.int64),
+            np.ascontiguousarray(phases, np.int64),
+            flags,
+            np.ascontiguousarray(pairs, np.int64),
+            np.ascontiguousarray(moved, float),
+            limit,
         )
-        return np.asarray(intervals), np.asarray(which)
+        return np.asarray(interval_indices), np.asarray(pair_indices)

@@ -27,6 +27,7 @@ TOLERANCE = 1e-6  # coal's default tolerance of GJK
 _MIN_PAIRS_PER_THREAD = 128  # distances, about 0.2 ms: fewer do not pay for another thread
 _ROUNDING = 1e-6  # [m] numerical error of coal's distances
 _MIN_ROWS_PER_THREAD = 16  # configurations, about 0.3 ms: fewer do not pay for another thread
+_NO_LIMIT = -1  # of the number of pairs, in calls of the compiled module
 
 
 class Witnesses(NamedTuple):
@@ -80,9 +81,9 @@ class Shapes:
         """
         other = object.__new__(Shapes)
         other.threads = self.threads
-        other.compiled = self.compiled.placed(
-            np.array(list(where), np.int64), flatten_placements(list(where.values()))
-        )
+        which = np.array(list(where), np.int64)
+        rows = flatten_placements(list(where.values()))
+        other.compiled = self.compiled.placed(which, rows)
         return other
 
     def compute_distances(self, moving: Floats, states: Ints, pairs: Ints) -> Floats:
@@ -93,16 +94,17 @@ class Shapes:
             states: State of each pair, shape (n,).
             pairs: Pairs of shape indices, shape (n, 2).
         """
-        found = self.compiled.distances(
-            moving, states, pairs, False, self._count_threads(len(pairs))
-        )
+        threads = self._count_threads(len(pairs))
+        with_witnesses = False
+        found = self.compiled.distances(moving, states, pairs, with_witnesses, threads)
         return np.asarray(found, float)
 
     def compute_witnesses(self, moving: Floats, states: Ints, pairs: Ints) -> Witnesses:
         """Return distances, normals and witness points; see `compute_distances`."""
-        return _to_witnesses(
-            self.compiled.distances(moving, states, pairs, True, self._count_threads(len(pairs)))
-        )
+        threads = self._count_threads(len(pairs))
+        with_witnesses = True
+        table = self.compiled.distances(moving, states, pairs, with_witnesses, threads)
+        return _to_witnesses(table)
 
     def find_closest_pairs(
         self,
@@ -135,19 +137,22 @@ class Shapes:
             Indices of the selected pairs, sorted by state, then by distance − margin; and their
             witnesses.
         """
-        limits, limit = np.column_stack([margins, bounds]), -1 if max_pairs is None else max_pairs
+        margins_and_bounds = np.column_stack([margins, bounds])
+        limit = _NO_LIMIT if max_pairs is None else max_pairs
         threads = self._count_threads(len(pairs))
         chosen, table = self.compiled.shortest(
-            moving, edges, pairs, ranks, limits, reach, limit, rounding, threads
+            moving, edges, pairs, ranks, margins_and_bounds, reach, limit, rounding, threads
         )
         return chosen, _to_witnesses(table)
 
-    def _count_threads(self, rows: int) -> int:
-        return max(1, min(self.threads, rows // _MIN_PAIRS_PER_THREAD))
+    def _count_threads(self, pairs: int) -> int:
+        return max(1, min(self.threads, pairs // _MIN_PAIRS_PER_THREAD))
 
 
 def _to_witnesses(table: Floats) -> Witnesses:
-    return Witnesses(table[:, 0], table[:, 1:4], table[:, 4:7], table[:, 7:10])
+    return Witnesses(
+        distance=table[:, 0], normal=table[:, 1:4], first=table[:, 4:7], second=table[:, 7:10]
+    )
 
 
 def compute_distance(
@@ -258,8 +263,11 @@ class Clearances:
     def __init__(
         self, placements: ShapePlacements, boxes: Boxes, shapes: Shapes, margins: Margins
     ) -> None:
-        self.placements, self.boxes, self.shapes, self.margins = placements, boxes, shapes, margins
-        self._parts = placements.compiled, boxes.compiled, shapes.compiled, margins.compiled
+        self.placements = placements
+        self.boxes = boxes
+        self.shapes = shapes
+        self.margins = margins
+        self._parts = (placements.compiled, boxes.compiled, shapes.compiled, margins.compiled)
         self._find_closest_pairs = load_compiled().nearest
         self._count_free = load_compiled().count_free
 
@@ -294,12 +302,11 @@ class Clearances:
             include_fixed: Include pairs of a moving and a fixed shape.
         """
         threads = max(1, min(self.shapes.threads, len(q) // _MIN_ROWS_PER_THREAD))
-        limit = -1 if max_pairs is None else max_pairs
-        return ClosePairs(
-            *self._find_closest_pairs(
-                *self._parts, q, z, waypoints, reach, limit, include_fixed, _ROUNDING, threads
-            )
+        limit = _NO_LIMIT if max_pairs is None else max_pairs
+        columns = self._find_closest_pairs(
+            *self._parts, q, z, waypoints, reach, limit, include_fixed, _ROUNDING, threads
         )
+        return ClosePairs(*columns)
 
     def count_free(
         self, q: Floats, z: Floats, edges: Ints, waypoint: int, *, reach: float, allowed: float
@@ -316,6 +323,5 @@ class Clearances:
             reach: Pairs further apart are ignored [m].
             allowed: Tolerated violation [m].
         """
-        return np.asarray(
-            self._count_free(*self._parts, q, z, edges, waypoint, reach, allowed, _ROUNDING)
-        )
+        counts = self._count_free(*self._parts, q, z, edges, waypoint, reach, allowed, _ROUNDING)
+        return np.asarray(counts)

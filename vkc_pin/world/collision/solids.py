@@ -6,7 +6,7 @@ import os
 import weakref
 from collections.abc import Sequence
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import coal
 import numpy as np
@@ -19,8 +19,20 @@ from vkc_pin.utils.system import count_cores
 from vkc_pin.world.files.meshes import get_triangles
 
 _MAX_THREADS = 8
-_cache: dict[int, tuple[weakref.ref[Any], bytes, float, Any]] = {}  # by the id of the shape
-_SIZE = 12
+_PLACEMENT_SIZE = 12
+_FIRST_TRANSLATION = 9  # index of the translation among the numbers of a placement
+
+
+class _Cached(NamedTuple):
+    """A solid of a shape, with the values of the shape when it was converted."""
+
+    owner: weakref.ref[Any]
+    points: bytes
+    radius: float
+    solid: Any
+
+
+_cache: dict[int, _Cached] = {}  # id of the shape → its solid
 
 
 def count_threads() -> int:
@@ -28,27 +40,31 @@ def count_threads() -> int:
 
     That is the number of cores available to this process, limited to 8 and to `OMP_NUM_THREADS`.
     """
+    threads = min(count_cores(), _MAX_THREADS)
     requested = os.environ.get("OMP_NUM_THREADS", "")
-    cores = count_cores()
-    return max(1, min(int(requested) if requested.isdigit() else cores, cores, _MAX_THREADS))
+    if requested.isdigit():
+        threads = min(threads, int(requested))
+    return max(1, threads)
 
 
 @cache
 def load_compiled() -> Any:
     """Return the compiled module, after importing coal and Pinocchio, whose libraries it uses."""
     module = import_compiled("vkc_pin.world.collision._distances")
-    for package, version, installed in (
-        ("coal", module.COAL_VERSION, coal.__version__),
-        ("pin", module.PINOCCHIO_VERSION, pin.__version__),
-    ):
-        built = version.split(".")[:2]
-        if built != installed.split(".")[:2]:
-            raise BuildError(
-                f"vkc_pin.world.collision was compiled against {package} {version}, "
-                f"but {installed} is installed. "
-                f"Either pip install '{package}=={'.'.join(built)}.*', or {REBUILD_HINT}"
-            )
+    _check_version("coal", module.COAL_VERSION, coal.__version__)
+    _check_version("pin", module.PINOCCHIO_VERSION, pin.__version__)
     return module
+
+
+def _check_version(package: str, version: str, installed: str) -> None:
+    """Raise `BuildError` if the compiled module was built with another minor version."""
+    built = version.split(".")[:2]
+    if built != installed.split(".")[:2]:
+        raise BuildError(
+            f"vkc_pin.world.collision was compiled against {package} {version}, "
+            f"but {installed} is installed. "
+            f"Either pip install '{package}=={'.'.join(built)}.*', or {REBUILD_HINT}"
+        )
 
 
 def convert_solid(shape: coal.CollisionGeometry) -> Any:
@@ -57,11 +73,11 @@ def convert_solid(shape: coal.CollisionGeometry) -> Any:
     Convex shapes and meshes are cached as long as the shape lives and its points do not change.
     """
     if isinstance(shape, coal.Convex):
-        return _convert_cached(
-            shape, np.asarray(shape.points(), np.float64), float(shape.getSweptSphereRadius())
-        )
+        points = np.asarray(shape.points(), np.float64)
+        return _convert_with_cache(shape, points, float(shape.getSweptSphereRadius()))
     if isinstance(shape, coal.BVHModelOBBRSS):
-        return _convert_cached(shape, np.asarray(shape.vertices(), np.float64), 0.0)
+        vertices = np.asarray(shape.vertices(), np.float64)
+        return _convert_with_cache(shape, vertices, 0.0)
     if isinstance(shape, coal.Box):
         numbers = shape.halfSide
     elif isinstance(shape, coal.Sphere):
@@ -88,19 +104,22 @@ def convert_solid(shape: coal.CollisionGeometry) -> Any:
     )
 
 
-def _convert_cached(shape: Any, points: Floats, radius: float) -> Any:
-    key, content = id(shape), points.tobytes()
-    if key in _cache:
-        owner, before, swept, solid = _cache[key]
-        if owner() is shape and before == content and swept == radius:
-            return solid
+def _convert_with_cache(shape: Any, points: Floats, radius: float) -> Any:
+    key = id(shape)
+    content = points.tobytes()
+    cached = _cache.get(key)
+    if cached is not None:
+        # Python gives the id of a deleted shape to a later one.
+        is_owner = cached.owner() is shape
+        if is_owner and cached.points == content and cached.radius == radius:
+            return cached.solid
     faces = get_triangles(shape)
-    solid = (
-        load_compiled().convex(points, faces, radius)
-        if isinstance(shape, coal.Convex)
-        else load_compiled().mesh(points, faces)
-    )
-    _cache[key] = (weakref.ref(shape, lambda _: _cache.pop(key, None)), content, radius, solid)
+    if isinstance(shape, coal.Convex):
+        solid = load_compiled().convex(points, faces, radius)
+    else:
+        solid = load_compiled().mesh(points, faces)
+    owner = weakref.ref(shape, lambda _: _cache.pop(key, None))
+    _cache[key] = _Cached(owner, content, radius, solid)
     return solid
 
 
@@ -109,9 +128,10 @@ def flatten_placements(placements: Sequence[pin.SE3]) -> Floats:
 
     Each row has the columns of the rotation, then the translation [m].
     """
-    rows = np.empty((len(placements), _SIZE))
+    rows = np.empty((len(placements), _PLACEMENT_SIZE))
     for row, placement in zip(rows, placements, strict=True):
-        row[:9], row[9:] = placement.rotation.T.ravel(), placement.translation
+        row[:_FIRST_TRANSLATION] = placement.rotation.T.ravel()
+        row[_FIRST_TRANSLATION:] = placement.translation
     return rows
 
 
@@ -124,13 +144,13 @@ class ShapePlacements:
     """
 
     def __init__(self, model: pin.Model, geometry: pin.GeometryModel) -> None:
-        shapes, serialized = geometry.geometryObjects, pin.serialization.StreamBuffer()
+        serialized = pin.serialization.StreamBuffer()
         model.saveToBinary(serialized)
         content = bytes(serialized.view())  # tobytes() would leak a view at every call
+        shapes = geometry.geometryObjects
         joints = np.array([shape.parentJoint for shape in shapes], np.int64)
-        self.compiled: Any = load_compiled().Bodies(
-            content, joints, flatten_placements([shape.placement for shape in shapes])
-        )
+        placements = flatten_placements([shape.placement for shape in shapes])
+        self.compiled: Any = load_compiled().Bodies(content, joints, placements)
 
     def compute_placements(self, q: Floats) -> Floats:
         """Return the placements of the shapes in the world frame, shape (W, M, 12).

@@ -49,18 +49,20 @@ class _Reader:
     """Reads one file. Surfaces of nodes and geometries are made once, whoever shows them."""
 
     def __init__(self, file: Path, submesh: str | None) -> None:
-        self.file, self.submesh = file, submesh
+        self.file = file
+        self.submesh = submesh
         self.root = parse_xml(read_bytes(file, "COLLADA", _MAX_FILE_SIZE), file)
         self.is_found = submesh is None
         self.names = dict[str, None]()
         self._elements = dict[tuple[str, str], ElementTree.Element]()
         for element in self.root.iter():
-            element.tag = element.tag.rpartition(":")[2]
-            if identifier := element.get("id"):
+            _, _, element.tag = element.tag.rpartition(":")
+            identifier = element.get("id")
+            if identifier:
                 self._elements.setdefault((element.tag, identifier), element)
         self._surfaces = dict[int, Surface]()  # by the id of a node's or geometry's element
         self._positions = dict[int, Floats]()  # by the id of an accessor
-        self._above = list[ElementTree.Element]()  # nodes that are being read
+        self._ancestors = list[ElementTree.Element]()  # nodes that are being read
 
     def read(self) -> tuple[Floats, Ints, float]:
         if self.root.tag != "COLLADA":
@@ -74,7 +76,8 @@ class _Reader:
         surfaces = [self._read_node(node) for node in self._list_roots()]
         if not self.is_found:
             raise UnknownNameError("submesh", str(self.submesh), self.names, file=self.file)
-        return *self._concatenate(surfaces), unit
+        vertices, triangles = self._concatenate(surfaces)
+        return vertices, triangles, unit
 
     def _read_unit(self) -> float:
         element = self.root.find("asset/unit")
@@ -105,11 +108,11 @@ class _Reader:
         """Return what a node shows, in the frame that contains it."""
         if id(node) in self._surfaces:
             return self._surfaces[id(node)]
-        if node in self._above:
+        if node in self._ancestors:
             raise make_element_error(
                 self.file, node, "a node shows itself", field="node", got=node.get("id", "")
             )
-        self._above.append(node)
+        self._ancestors.append(node)
         surfaces = list[Surface]()
         for child in node:
             if child.tag == "node":
@@ -118,8 +121,9 @@ class _Reader:
                 surfaces.append(self._read_node(self._find(child, "url", "node")))
             elif child.tag in ("instance_geometry", "instance_controller"):
                 surfaces.append(self._read_instance(node, child))
-        self._above.pop()
-        surface = _transform(self._concatenate(surfaces), self._read_placement(node))
+        self._ancestors.pop()
+        own_surface = self._concatenate(surfaces)
+        surface = _transform(own_surface, self._read_placement(node))
         self._surfaces[id(node)] = surface
         return surface
 
@@ -130,9 +134,9 @@ class _Reader:
             geometry = self._find(instance, "url", "geometry")
         else:
             geometry, bound = self._find_skinned(self._find(instance, "url", "controller"))
-        own = [node.get("name"), node.get("id"), geometry.get("name"), geometry.get("id")]
-        self.names.update(dict.fromkeys(name for name in own if name))
-        if self.submesh is not None and self.submesh not in own:
+        names = [node.get("name"), node.get("id"), geometry.get("name"), geometry.get("id")]
+        self.names.update(dict.fromkeys(name for name in names if name))
+        if self.submesh is not None and self.submesh not in names:
             return _EMPTY
         self.is_found = True
         if id(geometry) not in self._surfaces:
@@ -141,16 +145,18 @@ class _Reader:
 
     def _find_skinned(self, controller: ElementTree.Element) -> tuple[ElementTree.Element, Floats]:
         """Return the geometry of a skin or morph, and the matrix with which it was bound."""
-        bound, passed = np.eye(4), list[ElementTree.Element]()
+        bound = np.eye(4)
+        visited = list[ElementTree.Element]()
         while controller.tag == "controller":
-            if controller in passed:
+            if controller in visited:
                 raise make_element_error(self.file, controller, "a controller controls itself")
-            passed.append(controller)
-            kind = next((child for child in controller if child.tag in ("skin", "morph")), None)
-            if kind is None:
+            visited.append(controller)
+            kinds = [child for child in controller if child.tag in ("skin", "morph")]
+            if not kinds:
                 raise make_element_error(
                     self.file, controller, "a controller without <skin> or <morph>"
                 )
+            kind = kinds[0]
             matrix = kind.find("bind_shape_matrix")
             if matrix is not None:
                 bound = bound @ self._read_floats(matrix, 16).reshape(4, 4)
@@ -187,19 +193,18 @@ class _Reader:
                     got=f"<{mesh.tag}>",
                 )
             if mesh.tag in ("mesh", "convex_mesh"):
-                primitives = [element for element in mesh if element.tag in _PRIMITIVES]
-                surfaces += [self._read_primitive(mesh, element) for element in primitives]
+                for element in mesh:
+                    if element.tag in _PRIMITIVES:
+                        surfaces.append(self._read_primitive(mesh, element))
         return self._concatenate(surfaces)
 
     def _read_primitive(self, mesh: ElementTree.Element, primitive: ElementTree.Element) -> Surface:
         inputs = primitive.findall("input")
-        source = next(
-            (one for one in inputs if one.get("semantic") in ("VERTEX", "POSITION")), None
-        )
-        if source is None:
+        sources = [one for one in inputs if one.get("semantic") in ("VERTEX", "POSITION")]
+        if not sources:
             return _EMPTY
-        positions = self._read_positions(mesh, source)
-        place = self._read_count(source, "offset", 0)
+        positions = self._read_positions(mesh, sources[0])
+        offset = self._read_count(sources[0], "offset", 0)
         width = 1 + max(self._read_count(element, "offset", 0) for element in inputs)
 
         def read_corners(element: ElementTree.Element) -> Ints:
@@ -207,15 +212,16 @@ class _Reader:
             indices = self._read_integers(element)
             if len(indices) % width:
                 raise self._make_count_error(element, f"{width} for each corner", len(indices))
-            corners = indices[place::width]
+            corners = indices[offset::width]
             self._check_range(element, corners, len(positions))
             return corners
 
-        triangles = [_EMPTY[1]]
+        _, no_triangles = _EMPTY
+        triangles = [no_triangles]
         for element in primitive:
             if element.tag == "ph":
-                outline, holes = element.findall("p"), element.findall("h")
-                rings = [read_corners(ring) for ring in (*outline, *holes)]
+                outline_and_holes = (*element.findall("p"), *element.findall("h"))
+                rings = [read_corners(ring) for ring in outline_and_holes]
                 triangles.append(triangulate_polygon(positions, rings))
             elif element.tag == "p":
                 triangles += self._divide(primitive, positions, read_corners(element))
@@ -234,9 +240,11 @@ class _Reader:
                 expected = f"{counts.sum()} corners as in <vcount>"
                 raise self._make_count_error(primitive, expected, len(corners))
             starts = np.cumsum(counts) - counts
+            # All polygons of the same number of corners at once.
             for count in np.unique(counts):
                 first = starts[counts == count]
-                yield triangulate_polygons(positions, corners[first[:, None] + np.arange(count)])
+                polygons = corners[first[:, None] + np.arange(count)]
+                yield triangulate_polygons(positions, polygons)
         elif primitive.tag == "triangles":
             if len(corners) % 3:
                 raise self._make_count_error(primitive, "3 corners each", len(corners))
@@ -244,8 +252,10 @@ class _Reader:
         else:
             triangles = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
             if primitive.tag == "trifans":
+                # All triangles of a fan share its first corner.
                 triangles[:, 0] = corners[0] if len(corners) else 0
-            else:  # every other triangle of a strip turns the other way
+            else:
+                # Every other triangle of a strip has the opposite orientation.
                 triangles[1::2] = triangles[1::2, [1, 0, 2]]
             yield triangles
 
@@ -264,9 +274,13 @@ class _Reader:
             return self._positions[id(accessor)]
         array = self._find(accessor, "source", "float_array", "int_array", within=mesh)
         numbers = self._read_floats(array)
-        names = [parameter.get("name") for parameter in accessor.findall("param")]
         # Numbers without a name are to be skipped.
-        columns = [k for k, name in enumerate(names) if name] if any(names) else [0, 1, 2]
+        columns = list[int]()
+        for k, parameter in enumerate(accessor.findall("param")):
+            if parameter.get("name"):
+                columns.append(k)
+        if not columns:
+            columns = [0, 1, 2]
         stride = self._read_count(accessor, "stride", 1)
         offset = self._read_count(accessor, "offset", 0)
         if len(columns) < 3 or stride <= columns[2]:
@@ -277,6 +291,7 @@ class _Reader:
                 field="<accessor>",
                 expected="x, y and z",
             )
+        # Position k is at offset + stride · k + columns. As many are available as fit.
         available = max(len(numbers) - offset + stride - 1 - columns[2], 0) // stride
         count = min(self._read_count(accessor, "count", available), available)
         rows = offset + stride * np.arange(count)
@@ -293,11 +308,16 @@ class _Reader:
                 expected=f"at most {_MAX_TRIANGLES}",
                 got=count,
             )
-        surfaces = [surface for surface in surfaces if len(surface[1])]
-        starts = np.cumsum([0, *(len(vertices) for vertices, _ in surfaces)])
-        vertices = [_EMPTY[0], *(vertices for vertices, _ in surfaces)]
-        moved = [faces + start for (_, faces), start in zip(surfaces, starts, strict=False)]
-        return np.concatenate(vertices), np.concatenate([_EMPTY[1], *moved])
+        no_vertices, no_triangles = _EMPTY
+        all_vertices = [no_vertices]
+        all_triangles = [no_triangles]
+        start = 0  # index of the first vertex of a surface among all
+        for vertices, triangles in surfaces:
+            if len(triangles):
+                all_vertices.append(vertices)
+                all_triangles.append(triangles + start)
+                start += len(vertices)
+        return np.concatenate(all_vertices), np.concatenate(all_triangles)
 
     def _find(
         self,
@@ -322,12 +342,13 @@ class _Reader:
                 got=address,
             )
         for kind in kinds:
-            for near in () if within is None else within.iter(kind):
-                if near.get("id") == name:
-                    return near
+            inner = () if within is None else within.iter(kind)
+            for candidate in inner:
+                if candidate.get("id") == name:
+                    return candidate
             if (kind, name) in self._elements:
                 return self._elements[kind, name]
-        known = [name for kind, name in self._elements if kind in kinds]
+        known = [known_name for kind, known_name in self._elements if kind in kinds]
         raise UnknownNameError(
             kinds[0], name, known, file=self.file, line=find_line(element), field=f"<{element.tag}>"
         )
@@ -349,14 +370,14 @@ class _Reader:
         try:
             return np.array(words, np.int64)
         except (ValueError, OverflowError) as error:
-            wrong = next((word for word in words if not word.lstrip("+-").isdecimal()), str(error))
+            wrong_words = [word for word in words if not word.lstrip("+-").isdecimal()]
             raise make_element_error(
                 self.file,
                 element,
                 "not indices",
                 field=f"<{element.tag}>",
                 expected="whole numbers",
-                got=wrong,
+                got=wrong_words[0] if wrong_words else str(error),
             ) from error
 
     def _check_range(self, element: ElementTree.Element, corners: Ints, count: int) -> None:
@@ -412,6 +433,7 @@ def _make_rotation(numbers: Floats) -> Floats:
     """Return the rotation about an axis by an angle in degrees (Rodrigues' formula)."""
     length = np.linalg.norm(numbers[:3])
     x, y, z = numbers[:3] / (length or 1.0)
+    # R = I + sin θ [a]× + (1 − cos θ) [a]×², with [a]× v = a × v
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     angle = np.deg2rad(numbers[3])
     matrix = np.eye(4)
@@ -424,9 +446,10 @@ def _make_look_at(numbers: Floats) -> Floats:
     eye, target, up = numbers.reshape(3, 3)
     z = eye - target
     x = np.cross(up, z)
-    columns = [x, np.cross(z, x), z]
+    y = np.cross(z, x)
     matrix = np.eye(4)
-    matrix[:3, :3] = np.column_stack([axis / (np.linalg.norm(axis) or 1.0) for axis in columns])
+    for column, axis in enumerate((x, y, z)):
+        matrix[:3, column] = axis / (np.linalg.norm(axis) or 1.0)
     matrix[:3, 3] = eye
     return matrix
 

@@ -18,7 +18,9 @@ GLTF_SUFFIXES = (".gltf", ".glb")
 """Extensions of glTF files in lower case."""
 GLTF_TO_Z_UP = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], float)
 """Rotation by a right angle about x, from y up to z up, shape (4, 4)."""
-_TRIANGLE_FAN = 6  # mode of a primitive
+# Modes of primitives
+_TRIANGLES = 4  # the default
+_TRIANGLE_FAN = 6
 _MODES = range(7)  # points, lines and triangles
 # Extensions without effect on surfaces, or that trimesh reads as the specification demands; a file
 # may require others, which move or compress its vertices.
@@ -34,12 +36,12 @@ def check_gltf(file: Path) -> None:
     and extensions that the file requires. Invalid files are left to trimesh.
     """
     document = _read_document(file)
-    required = _get_list(document, "extensionsRequired")
-    unknown = [
-        name
-        for name in required
-        if isinstance(name, str) and not name.startswith(_KNOWN_PREFIXES) and name not in _KNOWN
-    ]
+    unknown = list[str]()
+    for name in _get_list(document, "extensionsRequired"):
+        if not isinstance(name, str) or name in _KNOWN:
+            continue
+        if not name.startswith(_KNOWN_PREFIXES):
+            unknown.append(name)
     if unknown:
         raise _make_error(file, "a required extension", ", ".join(unknown))
     for node in _get_list(document, "nodes"):
@@ -48,25 +50,34 @@ def check_gltf(file: Path) -> None:
     accessors = _get_list(document, "accessors")
     for mesh in _get_list(document, "meshes"):
         for primitive in _get_list(mesh, "primitives"):
-            if not isinstance(primitive, dict):
-                continue
-            if primitive.get("mode", 4) == _TRIANGLE_FAN or primitive.get("mode", 4) not in _MODES:
-                got = f"{mesh.get('name', 'a mesh')}: mode {primitive['mode']}"
-                raise _make_error(file, "this kind of primitive", got)
-            positions: Any = (primitive.get("attributes") or {}).get("POSITION")
-            name = mesh.get("name", "a mesh")
-            indices: Any = primitive.get("indices")
-            for number in (positions, indices):
-                is_valid = isinstance(number, int) and 0 <= number < len(accessors)
-                if is_valid and accessors[number].get("normalized"):
-                    raise _make_error(file, "normalized positions", name)
-                if is_valid and accessors[number].get("sparse"):
-                    raise _make_error(file, "a sparse accessor", name)
+            if isinstance(primitive, dict):
+                _check_primitive(file, primitive, accessors, mesh.get("name", "a mesh"))
+
+
+def _check_primitive(
+    file: Path, primitive: dict[str, Any], accessors: list[Any], mesh: str
+) -> None:
+    """Raise an `InputError` if trimesh would misread a primitive of a mesh of that name."""
+    mode = primitive.get("mode", _TRIANGLES)
+    if mode == _TRIANGLE_FAN or mode not in _MODES:
+        raise _make_error(file, "this kind of primitive", f"{mesh}: mode {mode}")
+    attributes: Any = primitive.get("attributes") or {}
+    positions: Any = attributes.get("POSITION")
+    indices: Any = primitive.get("indices")
+    for number in (positions, indices):
+        if not isinstance(number, int) or not 0 <= number < len(accessors):
+            continue
+        if accessors[number].get("normalized"):
+            raise _make_error(file, "normalized positions", mesh)
+        if accessors[number].get("sparse"):
+            raise _make_error(file, "a sparse accessor", mesh)
 
 
 def _read_document(file: Path) -> Any:
     """Return the JSON document of a file; None if there is no valid one."""
     data = file.read_bytes()
+    # A binary file has a header of 12 bytes, then the length of the first chunk, which is the
+    # document, and its type, of 4 bytes each.
     if data.startswith(b"glTF") and len(data) >= 20:
         (length,) = struct.unpack_from("<I", data, 12)
         data = data[20 : 20 + length]

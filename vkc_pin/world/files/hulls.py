@@ -18,9 +18,8 @@ if TYPE_CHECKING:
 
 SHEET_THICKNESS = 1e-3
 """Thickness of flat parts, such as pictures and rugs [m]."""
-_FLATNESS_RATIO = (
-    1e-5  # of the largest extent: thinner than 10 µm in a metre is drawn as a sheet, not as a solid
-)
+# Of the largest extent: thinner than 10 µm in a metre is drawn as a sheet, not as a solid.
+_FLATNESS_RATIO = 1e-5
 _MIN_CUT_DEPTH = 5e-4  # [m]: no cut takes away less
 _NUM_DIRECTIONS = 400  # of cuts, spread over the sphere
 _NUM_CUTS = 12  # deepest planes of which one is chosen
@@ -39,15 +38,16 @@ def thicken(points: ArrayLike, flatness: float = 0.0) -> tuple[Floats, bool]:
     `SHEET_THICKNESS`. So do sets thinner than `flatness` [m].
     """
     given = np.asarray(points, float)
-    around = given - given.mean(axis=0)
-    axes = np.linalg.eigh(around.T @ around)[1].T
-    extents = np.ptp(around @ axes.T, axis=0)
+    centered = given - given.mean(axis=0)
+    # The principal axes of the points, as rows.
+    _, eigenvectors = np.linalg.eigh(centered.T @ centered)
+    axes = eigenvectors.T
+    extents = np.ptp(centered @ axes.T, axis=0)
     (flat,) = np.nonzero(extents <= max(_FLATNESS_RATIO * extents.max(), flatness))
     found = given
     for axis in axes[flat]:
-        found = np.concatenate(
-            [found - SHEET_THICKNESS / 2.0 * axis, found + SHEET_THICKNESS / 2.0 * axis]
-        )
+        half_thickness = SHEET_THICKNESS / 2.0 * axis
+        found = np.concatenate([found - half_thickness, found + half_thickness])
     return found, bool(len(flat))
 
 
@@ -75,7 +75,8 @@ def _orient_faces(hull: ConvexHull) -> trimesh.Trimesh:
     import trimesh
 
     corners = np.sort(hull.vertices)
-    vertices, faces = hull.points[corners], np.searchsorted(corners, hull.simplices)
+    vertices = hull.points[corners]
+    faces = np.searchsorted(corners, hull.simplices)
     # Facets of small hulls have small areas: those without count relative to a size below 1 m.
     size = min(float(np.ptp(vertices, axis=0).max()), 1.0)
     crosses = trimesh.triangles.cross(vertices[faces])
@@ -103,36 +104,65 @@ def compute_outer_hull(points: ArrayLike, *, vertices: int = 40) -> trimesh.Trim
         points: Shape (n, 3) [m].
         vertices: Maximum number of vertices.
     """
-    hull = compute_hull(thicken(points)[0])
+    thick_points, _ = thicken(points)
+    hull = compute_hull(thick_points)
     corners = np.asarray(hull.vertices)
     normals = _sample_directions(hull)
-    offsets = np.concatenate(
-        [(corners @ some.T).max(axis=0) for some in np.array_split(normals, 1 + len(normals) // 64)]
-    )
-    axes = np.linalg.eigh(np.cov(corners.T))[1].T
-    found = []
-    for frame in (np.eye(3), axes):
-        box = np.vstack([frame, -frame])
-        chosen_normals, chosen_offsets = box, (corners @ box.T).max(axis=0)
-        polytope = _intersect_half_spaces(chosen_normals, chosen_offsets, corners)
-        for _ in range(4 * vertices):
-            depth = (polytope.points @ normals.T).max(axis=0) - offsets
-            order = np.argsort(-depth)[:_NUM_CUTS]
-            order = order[depth[order] > _MIN_CUT_DEPTH]
-            cut_off = _compute_cut_volumes(polytope, normals[order], offsets[order])
-            for k in order[np.argsort(-cut_off, kind="stable")]:
-                planes = (
-                    np.vstack([chosen_normals, normals[k]]),
-                    np.append(chosen_offsets, offsets[k]),
-                )
-                trial = _intersect_half_spaces(*planes, corners)
-                if len(trial.vertices) <= vertices:
-                    polytope, (chosen_normals, chosen_offsets) = trial, planes
-                    break
-            else:
+    offsets = _compute_tangent_offsets(corners, normals)
+    # The principal axes of the hull, as rows.
+    _, eigenvectors = np.linalg.eigh(np.cov(corners.T))
+    smallest = None
+    for axes in (np.eye(3), eigenvectors.T):
+        polytope = _cut_box(axes, corners, normals, offsets, vertices)
+        if smallest is None or polytope.volume < smallest.volume:
+            smallest = polytope
+    assert smallest is not None
+    return compute_hull(smallest.points)
+
+
+def _compute_tangent_offsets(corners: Floats, normals: Floats) -> Floats:
+    """Return the offsets d of the tangent planes normal·x = d of a hull, shape (k,) [m].
+
+    The products are computed in parts: together, those of a fine mesh would take much memory.
+    """
+    parts = np.array_split(normals, 1 + len(normals) // 64)
+    return np.concatenate([(corners @ part.T).max(axis=0) for part in parts])
+
+
+def _cut_box(
+    axes: Floats, corners: Floats, normals: Floats, offsets: Floats, vertices: int
+) -> ConvexHull:
+    """Return the box of a hull along `axes` after cuts; see `compute_outer_hull`.
+
+    Args:
+        axes: Axes of the box, as rows, shape (3, 3).
+        corners: Corners of the hull, shape (n, 3) [m].
+        normals: Normals of the candidate cuts, shape (k, 3).
+        offsets: Their offsets, shape (k,) [m]; see `_compute_tangent_offsets`.
+        vertices: Maximum number of vertices.
+    """
+    chosen_normals = np.vstack([axes, -axes])
+    chosen_offsets = (corners @ chosen_normals.T).max(axis=0)
+    polytope = _intersect_half_spaces(chosen_normals, chosen_offsets, corners)
+    for _ in range(4 * vertices):
+        depth = (polytope.points @ normals.T).max(axis=0) - offsets
+        deepest = np.argsort(-depth)[:_NUM_CUTS]
+        deepest = deepest[depth[deepest] > _MIN_CUT_DEPTH]
+        volumes = _compute_cut_volumes(polytope, normals[deepest], offsets[deepest])
+        largest_first = deepest[np.argsort(-volumes, kind="stable")]
+        for k in largest_first:
+            trial_normals = np.vstack([chosen_normals, normals[k]])
+            trial_offsets = np.append(chosen_offsets, offsets[k])
+            trial = _intersect_half_spaces(trial_normals, trial_offsets, corners)
+            if len(trial.vertices) <= vertices:
+                polytope = trial
+                chosen_normals = trial_normals
+                chosen_offsets = trial_offsets
                 break
-        found.append(polytope)
-    return compute_hull(min(found, key=lambda polytope: polytope.volume).points)
+        else:
+            # No cut is left that keeps to the number of vertices.
+            break
+    return polytope
 
 
 def _sample_directions(hull: trimesh.Trimesh) -> Floats:
@@ -140,11 +170,12 @@ def _sample_directions(hull: trimesh.Trimesh) -> Floats:
 
     Of the many facets of a finely meshed hull, only the largest of each direction counts.
     """
+    # A Fibonacci lattice: equal steps along z, and turns by the golden ratio.
     k = np.arange(_NUM_DIRECTIONS) + 0.5
-    z, turn = 1.0 - 2.0 * k / _NUM_DIRECTIONS, np.pi * (1.0 + 5.0**0.5) * k
-    spread = np.stack(
-        [np.sqrt(1.0 - z**2) * np.cos(turn), np.sqrt(1.0 - z**2) * np.sin(turn), z], axis=1
-    )
+    z = 1.0 - 2.0 * k / _NUM_DIRECTIONS
+    turn = np.pi * (1.0 + 5.0**0.5) * k
+    radius = np.sqrt(1.0 - z**2)
+    spread = np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=1)
     normals = np.asarray(hull.face_normals)
     first, _ = find_unique_rows(normals.round(2))
     if len(first) > _MAX_FACETS:
@@ -156,19 +187,31 @@ def _sample_directions(hull: trimesh.Trimesh) -> Floats:
 def _compute_cut_volumes(polytope: ConvexHull, normals: Floats, offsets: Floats) -> Floats:
     """Return the volumes of a polytope above planes, shape (k,) [m³].
 
-    They are sums of cones over the surface above a plane, with the apex in that plane.
+    They are sums of cones over the surface above a plane, with the apex in that plane: a facet of
+    the area A, whose plane is the distance h from the apex, contributes h A / 3 times the fraction
+    of A above the cut. Facets are triangles with heights low ≤ middle ≤ high above the cut. If one
+    corner is above it, a similar triangle is cut off, whose sides from that corner have the
+    fractions high / (high − low) and high / (high − middle).
     """
     corners = polytope.points[polytope.simplices]
-    areas = np.linalg.norm(np.cross(*(corners[:, 1:] - corners[:, :1]).transpose(1, 0, 2)), axis=1)
+    first_edges = corners[:, 1] - corners[:, 0]
+    second_edges = corners[:, 2] - corners[:, 0]
+    double_areas = np.linalg.norm(np.cross(first_edges, second_edges), axis=1)
+    facet_normals = polytope.equations[:, :3]
+    facet_offsets = polytope.equations[:, 3]
     apexes = offsets[:, None] * normals
-    cones = -(apexes @ polytope.equations[:, :3].T + polytope.equations[:, 3]) * areas / 6.0
+    cones = -(apexes @ facet_normals.T + facet_offsets) * double_areas / 6.0
     heights = np.einsum("ijk,lk->lij", corners, normals) - offsets[:, None, None]
     low, middle, high = np.moveaxis(np.sort(heights, axis=2), 2, 0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        tip = high**2 / ((high - low) * (high - middle))
-        foot = 1.0 - low**2 / ((low - middle) * (low - high))
-    share = np.where(middle <= 0.0, np.where(high > 0.0, tip, 0.0), np.where(low < 0.0, foot, 1.0))
-    return np.asarray((share * cones).sum(axis=1))
+        one_corner_above = high**2 / ((high - low) * (high - middle))
+        one_corner_below = 1.0 - low**2 / ((low - middle) * (low - high))
+    fraction = np.where(
+        middle <= 0.0,
+        np.where(high > 0.0, one_corner_above, 0.0),
+        np.where(low < 0.0, one_corner_below, 1.0),
+    )
+    return np.asarray((fraction * cones).sum(axis=1))
 
 
 def _intersect_half_spaces(
@@ -177,8 +220,9 @@ def _intersect_half_spaces(
     """Return the polytope {x: normals·x ≤ offsets}, which contains the points `inner`."""
     from scipy.spatial import ConvexHull, HalfspaceIntersection
 
-    centre = inner.mean(axis=0)
-    corners = HalfspaceIntersection(np.column_stack([normals, -offsets]), centre).intersections
+    center = inner.mean(axis=0)
+    half_spaces = np.column_stack([normals, -offsets])
+    corners = HalfspaceIntersection(half_spaces, center).intersections
     corners = corners[np.isfinite(corners).all(axis=1)]
     first, _ = find_unique_rows(corners.round(7))
     return ConvexHull(corners[np.sort(first)])

@@ -29,24 +29,35 @@ _XACRO_DEFINITIONS = ("xacro:arg", "xacro:property")
 
 
 def _check_limits(file: Path, name: str, joint: ElementTree.Element) -> None:
-    is_limited, limits = joint.get("type") in _LIMITED_TYPES, joint.findall("limit")
+    is_limited = joint.get("type") in _LIMITED_TYPES
+    limits = joint.findall("limit")
     if is_limited and not limits:
         problem = f"a {joint.get('type')} joint without limits"
         raise make_element_error(file, joint, problem, field=name, expected="<limit>")
     for limit in limits:
-        keys = ("lower", "upper", "velocity", "effort")
-        lower, upper, *rates = (_parse_limit(file, name, limit, key)[0] for key in keys)
-        for key, rate in zip(keys[2:], rates, strict=True):
-            if rate < 0.0 or 0.0 < rate < MIN_POSITIVE:
-                problem, field = f"{key} limit out of range", f"{name}: limit {key}"
-                expected = f"{MIN_POSITIVE:g} or more, or 0 for none"
+        lower = _parse_limit(file, name, limit, "lower")
+        upper = _parse_limit(file, name, limit, "upper")
+        velocity = _parse_limit(file, name, limit, "velocity")
+        effort = _parse_limit(file, name, limit, "effort")
+        for key, value in (("velocity", velocity), ("effort", effort)):
+            if value < 0.0 or 0.0 < value < MIN_POSITIVE:
                 raise make_element_error(
-                    file, limit, problem, field=field, expected=expected, got=f"{rate:g}"
+                    file,
+                    limit,
+                    f"{key} limit out of range",
+                    field=f"{name}: limit {key}",
+                    expected=f"{MIN_POSITIVE:g} or more, or 0 for none",
+                    got=f"{value:g}",
                 )
         if is_limited and lower > upper:
-            problem, got = "limits in the wrong order", f"{lower:g} and {upper:g}"
-            field, expected = f"{name}: limit", "lower ≤ upper"
-            raise make_element_error(file, limit, problem, field=field, expected=expected, got=got)
+            raise make_element_error(
+                file,
+                limit,
+                "limits in the wrong order",
+                field=f"{name}: limit",
+                expected="lower ≤ upper",
+                got=f"{lower:g} and {upper:g}",
+            )
 
 
 def check_tree(file: Path, root: ElementTree.Element) -> None:
@@ -57,32 +68,46 @@ def check_tree(file: Path, root: ElementTree.Element) -> None:
     """
     for element in root.iter():
         if element.tag.startswith("xacro:") and element.tag not in _XACRO_DEFINITIONS:
-            expected, got = "a plain URDF: xacro FILE > robot.urdf", f"<{element.tag}>"
             raise make_element_error(
-                file, element, "xacro has not been run", expected=expected, got=got
+                file,
+                element,
+                "xacro has not been run",
+                expected="a plain URDF: xacro FILE > robot.urdf",
+                got=f"<{element.tag}>",
             )
     links = _index_by_name(file, root, "link")
     if not links:
         raise InputError("there are no links", file=file, expected="<link> elements")
-    above: dict[str, tuple[str, str]] = {}  # link → its parent, and the joint between
+    parents: dict[str, tuple[str, str]] = {}  # link → its parent, and the joint between
     joints = _index_by_name(file, root, "joint")
     for name, joint in joints.items():
         _check_joint(file, name, joint, joints)
-        parent, child = (_find_link(file, name, joint, key, links) for key in ("parent", "child"))
-        if child in above:
-            problem, got = "a link with two parents", f"joints '{above[child][1]}' and '{name}'"
+        parent = _find_link(file, name, joint, "parent", links)
+        child = _find_link(file, name, joint, "child", links)
+        if child in parents:
+            _, other_joint = parents[child]
             raise make_element_error(
-                file, joint, problem, field=child, expected="one joint", got=got
+                file,
+                joint,
+                "a link with two parents",
+                field=child,
+                expected="one joint",
+                got=f"joints '{other_joint}' and '{name}'",
             )
-        above[child] = parent, name
+        parents[child] = (parent, name)
         if joint.get("type") == "revolute" and _has_no_limits(file, name, joint):
             joint.set("type", "continuous")
     lines = {name: find_line(link) for name, link in links.items()}
-    roots = list(dict.fromkeys(find_roots(file, lines, above).values()))
+    roots = list(dict.fromkeys(find_roots(file, lines, parents).values()))
     if len(roots) > 1:
-        problem, got, second = "links that nothing connects", ", ".join(roots[:5]), roots[1]
+        second = roots[1]
         raise make_element_error(
-            file, links[second], problem, field=second, expected="one root", got=got
+            file,
+            links[second],
+            "links that nothing connects",
+            field=second,
+            expected="one root",
+            got=", ".join(roots[:5]),
         )
 
 
@@ -95,51 +120,59 @@ def simplify_tree(file: Path, root: ElementTree.Element) -> tuple[str, frozenset
         The URDF, and the joints without a velocity limit.
     """
     plain = ElementTree.Element("robot", name=root.get("name") or replace_forbidden(file.stem))
-    silent = set[str]()
     for link in root.findall("link"):
-        added = ElementTree.SubElement(plain, "link", name=link.get("name", ""))
-        if (inertial := link.find("inertial")) is not None:
-            _add_inertial(file, added, inertial)
+        plain_link = ElementTree.SubElement(plain, "link", name=link.get("name", ""))
+        inertial = link.find("inertial")
+        if inertial is not None:
+            _add_inertial(file, plain_link, inertial)
+    without_velocity = set[str]()
     for joint in root.findall("joint"):
-        name, kind = joint.get("name", ""), joint.get("type", "")
-        added = ElementTree.SubElement(plain, "joint", name=name, type=kind)
-        _add_origin(file, added, joint.find("origin"), name)
+        name = joint.get("name", "")
+        kind = joint.get("type", "")
+        plain_joint = ElementTree.SubElement(plain, "joint", name=name, type=kind)
+        origin = joint.find("origin")
+        if origin is not None:
+            _add_origin(file, plain_joint, origin, name)
         for key in ("parent", "child"):
-            if (end := joint.find(key)) is not None:
-                ElementTree.SubElement(added, key, link=end.get("link", ""))
-        if kind not in _TYPES_WITHOUT_AXIS and (axis := joint.find("axis")) is not None:
-            ElementTree.SubElement(
-                added,
-                "axis",
-                xyz=_format_numbers(
-                    parse_numbers(file, axis, "xyz", 3, default="1 0 0", where=name)
-                ),
-            )
-        if (limit := joint.find("limit")) is not None and kind not in _TYPES_WITHOUT_AXIS:
-            silent.update([name] if limit.get("velocity") is None else [])
-            if kind in _LIMITED_TYPES and limit.get("lower") is None and limit.get("upper") is None:
-                warnings.warn(
-                    f"{file}:{find_line(limit)}: {name}: "
-                    "a limit without lower and upper: it cannot move",
-                    stacklevel=2,
-                )
-            said = {
-                key: _format_numbers(_parse_limit(file, name, limit, key))
-                for key in ("lower", "upper", "velocity", "effort")
-            }
-            ElementTree.SubElement(added, "limit", said)
-    return ElementTree.tostring(plain, encoding="unicode"), frozenset(silent)
+            end = joint.find(key)
+            if end is not None:
+                ElementTree.SubElement(plain_joint, key, link=end.get("link", ""))
+        if kind in _TYPES_WITHOUT_AXIS:
+            continue
+        axis = joint.find("axis")
+        if axis is not None:
+            direction = parse_numbers(file, axis, "xyz", 3, default="1 0 0", where=name)
+            ElementTree.SubElement(plain_joint, "axis", xyz=_format_numbers(direction))
+        limit = joint.find("limit")
+        if limit is not None:
+            _add_limit(file, plain_joint, limit)
+            if limit.get("velocity") is None:
+                without_velocity.add(name)
+    return ElementTree.tostring(plain, encoding="unicode"), frozenset(without_velocity)
 
 
 def _add_origin(
-    file: Path, parent: ElementTree.Element, origin: ElementTree.Element | None, where: str
+    file: Path, joint: ElementTree.Element, origin: ElementTree.Element, where: str
 ) -> None:
-    if origin is not None:
-        said = {
-            key: _format_numbers(parse_numbers(file, origin, key, 3, default="0 0 0", where=where))
-            for key in ("xyz", "rpy")
-        }
-        ElementTree.SubElement(parent, "origin", said)
+    position = parse_numbers(file, origin, "xyz", 3, default="0 0 0", where=where)
+    angles = parse_numbers(file, origin, "rpy", 3, default="0 0 0", where=where)
+    ElementTree.SubElement(
+        joint, "origin", xyz=_format_numbers(position), rpy=_format_numbers(angles)
+    )
+
+
+def _add_limit(file: Path, joint: ElementTree.Element, limit: ElementTree.Element) -> None:
+    name = joint.get("name", "")
+    has_range = limit.get("lower") is not None or limit.get("upper") is not None
+    if joint.get("type") in _LIMITED_TYPES and not has_range:
+        warnings.warn(
+            f"{file}:{find_line(limit)}: {name}: a limit without lower and upper: it cannot move",
+            stacklevel=3,
+        )
+    values = {}
+    for key in ("lower", "upper", "velocity", "effort"):
+        values[key] = _format_numbers((_parse_limit(file, name, limit, key),))
+    ElementTree.SubElement(joint, "limit", values)
 
 
 def _add_inertial(file: Path, link: ElementTree.Element, inertial: ElementTree.Element) -> None:
@@ -153,22 +186,20 @@ def _add_inertial(file: Path, link: ElementTree.Element, inertial: ElementTree.E
         added, "origin", xyz=_format_numbers(position), rpy=_format_numbers(angles)
     )
     ElementTree.SubElement(added, "mass", value=_format_numbers((mass,)))
-    ElementTree.SubElement(
-        added,
-        "inertia",
-        {key: _format_numbers((value,)) for key, value in zip(MOMENTS, moments, strict=True)},
-    )
+    inertia = ElementTree.SubElement(added, "inertia")
+    for key, moment in zip(MOMENTS, moments, strict=True):
+        inertia.set(key, _format_numbers((moment,)))
 
 
 def parse_origin(
     file: Path, element: ElementTree.Element, where: str
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return position [m] and roll, pitch, yaw [rad] of an element's <origin>, or zeros."""
-    if (origin := element.find("origin")) is None:
+    origin = element.find("origin")
+    if origin is None:
         return (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-    position, angles = (
-        parse_numbers(file, origin, key, 3, default="0 0 0", where=where) for key in ("xyz", "rpy")
-    )
+    position = parse_numbers(file, origin, "xyz", 3, default="0 0 0", where=where)
+    angles = parse_numbers(file, origin, "rpy", 3, default="0 0 0", where=where)
     return position, angles
 
 
@@ -176,20 +207,21 @@ def parse_inertial(
     file: Path, inertial: ElementTree.Element, where: str
 ) -> tuple[float, tuple[float, ...], tuple[tuple[float, ...], tuple[float, ...]]]:
     """Return mass [kg], moments [kg·m²] in the order of `MOMENTS`, and origin of an <inertial>."""
-    mass, inertia = inertial.find("mass"), inertial.find("inertia")
-    if mass is None or inertia is None:
-        lacks = f"an <inertial> without <{'mass' if mass is None else 'inertia'}>"
-        raise make_element_error(file, inertial, lacks, field=where)
-    (weight,) = parse_numbers(file, mass, "value", 1, default=None, where=where, largest=_MAX_MASS)
-    if weight < 0.0:
+    mass = inertial.find("mass")
+    if mass is None:
+        raise make_element_error(file, inertial, "an <inertial> without <mass>", field=where)
+    inertia = inertial.find("inertia")
+    if inertia is None:
+        raise make_element_error(file, inertial, "an <inertial> without <inertia>", field=where)
+    (value,) = parse_numbers(file, mass, "value", 1, default=None, where=where, largest=_MAX_MASS)
+    if value < 0.0:
         raise make_element_error(
-            file, mass, "a negative mass", field=where, expected="0 kg or more", got=weight
+            file, mass, "a negative mass", field=where, expected="0 kg or more", got=value
         )
-    moments = tuple(
-        parse_numbers(file, inertia, key, 1, default="0", where=where, largest=_MAX_MASS)[0]
-        for key in MOMENTS
-    )
-    return weight, moments, parse_origin(file, inertial, where)
+    moments = list[float]()
+    for key in MOMENTS:
+        moments += parse_numbers(file, inertia, key, 1, default="0", where=where, largest=_MAX_MASS)
+    return value, tuple(moments), parse_origin(file, inertial, where)
 
 
 def _format_numbers(values: tuple[float, ...]) -> str:
@@ -219,26 +251,32 @@ def parse_numbers(
         largest: Largest valid magnitude.
         is_finite: Whether infinite numbers are invalid.
     """
-    text = element.get(key, default)
-    parts = (text or "").split()
+    stated = element.get(key, default)
+    text = stated or ""
     # Commas count between all numbers only: in "0,5 1" it would be a decimal point.
-    by_comma = [part.strip() for part in (text or "").strip().rstrip(",").split(",")]
-    if has_commas := len(by_comma) == count > 1:
-        parts = by_comma
+    by_comma = [part.strip() for part in text.strip().rstrip(",").split(",")]
+    has_commas = len(by_comma) == count > 1
+    parts = by_comma if has_commas else text.split()
     try:
         values = tuple(map(float, parts))
     except ValueError:
         values = ()
-    is_valid = len(values) == count and all(abs(value) <= largest for value in values)
-    if not is_valid or (is_finite and not all(map(math.isfinite, values))):
-        field = f"{where}: {element.tag} {key}"
-        expected = (
-            f"{count} finite numbers with spaces between them" if count > 1 else "1 finite number"
-        )
-        if values and len(values) == count and all(map(math.isfinite, values)):
+    has_count = len(values) == count
+    all_finite = all(map(math.isfinite, values))
+    in_range = all(abs(value) <= largest for value in values)
+    if not has_count or not in_range or (is_finite and not all_finite):
+        expected = "1 finite number"
+        if count > 1:
+            expected = f"{count} finite numbers with spaces between them"
+        if values and has_count and all_finite:
             expected = f"at most {largest:g}"
         raise make_element_error(
-            file, element, "wrong numbers", field=field, expected=expected, got=text
+            file,
+            element,
+            "wrong numbers",
+            field=f"{where}: {element.tag} {key}",
+            expected=expected,
+            got=stated,
         )
     if has_commas:
         warnings.warn(f"{file}: {element.tag} {key}: commas are read as spaces", stacklevel=2)
@@ -284,20 +322,21 @@ def _find_link(
     return link
 
 
-def _parse_limit(file: Path, name: str, limit: ElementTree.Element, key: str) -> tuple[float]:
+def _parse_limit(file: Path, name: str, limit: ElementTree.Element, key: str) -> float:
     (value,) = parse_numbers(file, limit, key, 1, default="0", where=name, largest=math.inf)
     if key in ("lower", "upper"):
         value = min(max(value, -MAX_COORDINATE), MAX_COORDINATE)
-    return (value,)
+    return value
 
 
 def _has_no_limits(file: Path, name: str, joint: ElementTree.Element) -> bool:
     """Return whether both limits of a joint are so large that they mean none."""
-    return all(
-        abs(_parse_limit(file, name, limit, key)[0]) == MAX_COORDINATE
-        for limit in joint.findall("limit")
-        for key in ("lower", "upper")
-    )
+    for limit in joint.findall("limit"):
+        lower = _parse_limit(file, name, limit, "lower")
+        upper = _parse_limit(file, name, limit, "upper")
+        if abs(lower) < MAX_COORDINATE or abs(upper) < MAX_COORDINATE:
+            return False
+    return True
 
 
 def _check_joint(
@@ -305,20 +344,25 @@ def _check_joint(
 ) -> None:
     kind = joint.get("type")
     if kind not in _JOINT_TYPES:
-        problem, expected = "this joint type is not supported", ", ".join(_JOINT_TYPES)
+        problem = "this joint type is not supported"
+        expected = ", ".join(_JOINT_TYPES)
         raise make_element_error(file, joint, problem, field=name, expected=expected, got=kind)
     for origin in joint.findall("origin"):
         for key in ("xyz", "rpy"):
             parse_numbers(file, origin, key, 3, default="0 0 0", where=name)
-    for axis in joint.findall("axis") if kind not in _TYPES_WITHOUT_AXIS else ():
-        if not math.hypot(*parse_numbers(file, axis, "xyz", 3, default="1 0 0", where=name)) > 0.0:
-            problem, got = "an axis without direction", axis.get("xyz")
-            raise make_element_error(file, axis, problem, field=name, got=got)
+    axes = [] if kind in _TYPES_WITHOUT_AXIS else joint.findall("axis")
+    for axis in axes:
+        direction = parse_numbers(file, axis, "xyz", 3, default="1 0 0", where=name)
+        if not math.hypot(*direction) > 0.0:
+            problem = "an axis without direction"
+            raise make_element_error(file, axis, problem, field=name, got=axis.get("xyz"))
     _check_limits(file, name, joint)
     for mimic in joint.findall("mimic"):
-        if (followed := mimic.get("joint", "")) not in joints:  # occurs in published robots
+        leader = mimic.get("joint", "")
+        # Published robots have couplings to joints that do not exist.
+        if leader not in joints:
             warnings.warn(
-                f"{file}:{find_line(mimic)}: {name}: there is no joint '{followed}' to follow",
+                f"{file}:{find_line(mimic)}: {name}: there is no joint '{leader}' to follow",
                 stacklevel=2,
             )
         for key, default in (("multiplier", "1"), ("offset", "0")):
@@ -338,14 +382,21 @@ def find_roots(
     roots = {link: link for link in lines if link not in above}
     for link in lines:
         path = list(_walk_to_root(link, above, roots))
-        if path and path[-1] in path[:-1]:
-            circle = path[path.index(path[-1]) :]
-            problem, got = "links in a circle", " → ".join(circle[::-1])
+        if not path:
+            continue
+        last = path[-1]
+        if last in path[:-1]:
+            circle = path[path.index(last) :]
             raise InputError(
-                problem, file=file, line=lines[link], field=link, expected="a tree", got=got
+                "links in a circle",
+                file=file,
+                line=lines[link],
+                field=link,
+                expected="a tree",
+                got=" → ".join(circle[::-1]),
             )
-        if path:
-            roots |= dict.fromkeys(path, roots[above[path[-1]][0]])
+        parent, _ = above[last]
+        roots.update(dict.fromkeys(path, roots[parent]))
     return {link: roots[link] for link in lines}
 
 
@@ -353,10 +404,10 @@ def _walk_to_root(
     link: str, above: Mapping[str, tuple[str, str]], reaches: Collection[str]
 ) -> Iterator[str]:
     """Yield a link and its ancestors, up to a link in `reaches` or the first repeated one."""
-    passed: set[str] = set()
+    visited = set[str]()
     while link not in reaches:
         yield link
-        if link in passed:
+        if link in visited:
             return
-        passed.add(link)
-        link = above[link][0]
+        visited.add(link)
+        link, _ = above[link]

@@ -51,7 +51,8 @@ _MAX_CACHED_HULLS = 512  # that a process keeps: robots are loaded again and aga
 _HULL_VERSION = 1
 _MAX_KEPT_MESHES = 256  # for display, likewise: a robot has 20
 _SMALLEST = 1e-6  # [m] size of meshes, below which triangles have no area in floating point
-_HULL_TOLERANCE = 1e-6  # how far, relatively, coal's volume and area may be from trimesh's
+_HULL_TOLERANCE = 1e-6  # relative difference between coal's volume and area and trimesh's
+_SMALL_HULL_VERTICES = 60  # of hulls that replace those with corners of too many neighbours
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +132,10 @@ def load_mesh(
 
 
 def _read_mesh(file: Path, submesh: str | None) -> Any:
-    """Return a mesh, or what trimesh takes a file for, with z up if the format states its axes."""
+    """Return trimesh's object of a file, normally a mesh, with z up if the format states its axes.
+
+    Files without faces become other objects, such as point clouds.
+    """
     import trimesh
 
     kind = file.suffix.lower()
@@ -163,25 +167,32 @@ def _find_polygons(mesh: trimesh.Trimesh) -> tuple[Floats, list[Ints]]:
     elements = mesh.metadata.get("_ply_raw", {})
     if not {"vertex", "face"} <= set(elements):
         return np.empty((0, 3)), []
-    points, faces = elements["vertex"]["data"], elements["face"]["data"]
+    points = elements["vertex"]["data"]
     vertices = np.column_stack([np.asarray(points[axis], float) for axis in "xyz"])
+    faces = elements["face"]["data"]
     is_text = isinstance(faces, dict)
     names = list(faces) if is_text else list(faces.dtype.names)
-    name = next((name for name in names if name.startswith("vertex_ind")), names[0])
+    # The property is called vertex_index or vertex_indices.
+    vertex_names = [name for name in names if name.startswith("vertex_ind")]
+    indices = faces[vertex_names[0] if vertex_names else names[0]]
     # Lists in binary files hold their length and their items.
-    polygons = faces[name] if is_text else faces[name]["f1"]
+    polygons = indices if is_text else indices["f1"]
     are_triangles = np.shape(polygons) == (len(polygons), 3)
-    return vertices, [] if are_triangles else [np.array(one, np.int64) for one in polygons]
+    if are_triangles:
+        return vertices, []
+    return vertices, [np.array(polygon, np.int64) for polygon in polygons]
 
 
 def _extract_submesh(scene: trimesh.Scene, file: Path, submesh: str) -> trimesh.Scene:
     """Return the part of a scene whose node or geometry has a name."""
     import trimesh
 
-    found, names = trimesh.Scene(), dict[str, None]()
+    found = trimesh.Scene()
+    names = dict[str, None]()
     for node in scene.graph.nodes_geometry:
         transform, geometry = scene.graph[node]
-        names.update({str(node): None, str(geometry): None})
+        names[str(node)] = None
+        names[str(geometry)] = None
         if submesh in (str(node), str(geometry)):
             found.add_geometry(scene.geometry[geometry], transform=transform)
     if not found.geometry:
@@ -190,7 +201,10 @@ def _extract_submesh(scene: trimesh.Scene, file: Path, submesh: str) -> trimesh.
 
 
 def _open_mesh(file: Path, submesh: str | None = None) -> tuple[Path | io.BytesIO, dict[str, Any]]:
-    """Return what trimesh reads a mesh from, changed where it would misread it, and settings."""
+    """Return the file or data that trimesh reads, and its settings.
+
+    Files that trimesh would misread are changed in memory.
+    """
     settings: dict[str, Any] = {"resolver": _make_resolver(file)}
     kind = file.suffix.lower()[1:]
     if f".{kind}" in GLTF_SUFFIXES:
@@ -198,7 +212,8 @@ def _open_mesh(file: Path, submesh: str | None = None) -> tuple[Path | io.BytesI
     if kind not in ("obj", "gltf"):
         return file, settings
     data = file.read_bytes()
-    if is_utf16 := data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+    is_utf16 = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    if is_utf16:
         data = data.decode("utf-16").encode()
     if kind == "obj" and (submesh is not None or not is_plain_obj(data)):
         data = normalize_obj(data, file, submesh)
@@ -206,7 +221,8 @@ def _open_mesh(file: Path, submesh: str | None = None) -> tuple[Path | io.BytesI
         data = data.removeprefix(codecs.BOM_UTF8)
     else:
         return file, settings
-    return io.BytesIO(data), {**settings, "file_type": kind}
+    settings["file_type"] = kind
+    return io.BytesIO(data), settings
 
 
 def _make_resolver(file: Path) -> Any:
@@ -224,8 +240,9 @@ def _make_resolver(file: Path) -> Any:
         if is_gltf and not (file.parent / name).exists():
             name = unquote(name)
         for place in _list_places(file, name):
+            # A pipe or a device may be endless.
             if place.exists() and not place.is_file():
-                raise FileNotFoundError(f"{place} is not a regular file")  # it may be endless
+                raise FileNotFoundError(f"{place} is not a regular file")
         return bytes(read(name))
 
     resolver.get = get
@@ -250,15 +267,15 @@ def load_convex(
     file = check_path(path, "path", "a mesh file")
     if file.is_file():
         stat = file.stat()
-        with contextlib.suppress(InputError):  # raised below, with `about`
-            kept = _load_hull(
-                file.absolute(),
-                (stat.st_mtime_ns, stat.st_size),
-                tuple(_check_scale(file, scale).tolist()),
-            )
-            if kept is not None:
-                return kept
-    return make_convex_hull(load_mesh(path, scale).vertices, file=path, about=about)
+        version = (stat.st_mtime_ns, stat.st_size)
+        # An error is raised below, with `about`.
+        with contextlib.suppress(InputError):
+            factors = tuple(_check_scale(file, scale).tolist())
+            hull = _load_hull(file.absolute(), version, factors)
+            if hull is not None:
+                return hull
+    points = load_mesh(path, scale).vertices
+    return make_convex_hull(points, file=path, about=about)
 
 
 @lru_cache(maxsize=_MAX_CACHED_HULLS)
@@ -273,7 +290,8 @@ def _load_hull(
 
     def build() -> tuple[list[list[float]], list[list[int]]] | None:
         points = load_mesh(file, scale).vertices
-        if thicken(np.asarray(points, float))[1]:
+        _, is_flat = thicken(np.asarray(points, float))
+        if is_flat:
             return None
         hull = make_convex_hull(points, file=file)
         return np.asarray(hull.points()).tolist(), get_triangles(hull).tolist()
@@ -315,7 +333,8 @@ def make_convex_hull(
     if not len(given):
         raise InputError("a hull of nothing", file=file, field=about, expected="at least one point")
     given, was_flat = thicken(given)
-    if (size := float(np.ptp(given, axis=0).max())) < _SMALLEST:
+    size = float(np.ptp(given, axis=0).max())
+    if size < _SMALLEST:
         raise InputError(
             "the mesh is too small: is its unit or scale wrong?",
             file=file,
@@ -324,26 +343,43 @@ def make_convex_hull(
             got=f"{size:.3g}",
         )
     if was_flat:
-        named = " of ".join(str(part) for part in (about, file) if part is not None) or "a mesh"
+        names = [str(part) for part in (about, file) if part is not None]
+        name = " of ".join(names) or "a mesh"
         warnings.warn(
-            f"{named} is flat: it collides as a plate, {1e3 * SHEET_THICKNESS:g} mm thick",
+            f"{name} is flat: it collides as a plate, {1e3 * SHEET_THICKNESS:g} mm thick",
             stacklevel=2,
         )
     hull = compute_hull(given)
+    # The tip of a finely meshed cone, and the middle of a fine disc, have many neighbours.
     faces_per_corner = np.bincount(np.asarray(hull.faces).ravel())
-    if faces_per_corner.max() > _MAX_NEIGHBOURS:  # the tip of a finely meshed cone, a fine disc
-        hull = compute_outer_hull(hull.vertices, vertices=60)
+    if faces_per_corner.max() > _MAX_NEIGHBOURS:
+        hull = compute_outer_hull(hull.vertices, vertices=_SMALL_HULL_VERTICES)
     shape = _make_convex(hull.vertices, np.asarray(hull.faces).tolist())
-    # Volumes of small hulls far from the origin are inexact; this one is about the hull's middle.
-    held_points = np.asarray(shape.points())
-    a, b, c = (held_points - held_points.mean(axis=0))[get_triangles(shape)].transpose(1, 0, 2)
+    volume, area = _measure(shape)
+    for quantity, measured, expected in (
+        ("volume", volume, hull.volume),
+        ("area", area, hull.area),
+    ):
+        is_equal = abs(measured - expected) <= _HULL_TOLERANCE * abs(expected)
+        if not is_equal or expected <= 0.0:
+            problem = f"coal does not hold this hull: wrong {quantity}"
+            raise InputError(problem, file=file, field=about, expected=expected, got=measured)
+    return shape
+
+
+def _measure(shape: coal.Convex) -> tuple[float, float]:
+    """Return the volume [m³] and the area [m²] of a coal shape.
+
+    The triangle a, b, c has the area |(b − a) × (c − a)| / 2, and spans with the origin the volume
+    a · (b × c) / 6. Volumes of small hulls far from the origin are inexact; therefore the origin is
+    the mean of the corners.
+    """
+    corners = np.asarray(shape.points())
+    centered = corners - corners.mean(axis=0)
+    a, b, c = centered[get_triangles(shape)].transpose(1, 0, 2)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2.0
     volume = np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0
-    for what, held, wanted in (("volume", volume, hull.volume), ("area", area, hull.area)):
-        if not abs(held - wanted) <= _HULL_TOLERANCE * abs(wanted) or wanted <= 0.0:
-            problem = f"coal does not hold this hull: wrong {what}"
-            raise InputError(problem, file=file, field=about, expected=wanted, got=held)
-    return shape
+    return volume, area
 
 
 Versions = dict[Path, tuple[int, int] | None]
@@ -364,17 +400,18 @@ def load_parts(
     """
     file = Path(path)
     if file.suffix.lower() != ".obj" or not file.is_file():
-        whole = load_mesh(file, scale)
-        return [
-            simplify_mesh(MeshPart(np.asarray(whole.vertices), np.asarray(whole.faces)), detail)
-        ]
+        mesh = load_mesh(file, scale)
+        whole = MeshPart(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+        return [simplify_mesh(whole, detail)]
     factors = _check_scale(file, scale)
     key = (file.absolute(), tuple(factors.tolist()), detail)
     versions, parts = _kept_parts.pop(key, ({}, []))
     if not versions or versions != _read_versions(versions):
         versions = _read_versions([file])
-        parts = [simplify_mesh(part, detail) for part in _read_obj_parts(file, factors, versions)]
-    _kept_parts[key] = versions, parts  # as the last one
+        fine_parts = _read_obj_parts(file, factors, versions)
+        parts = [simplify_mesh(part, detail) for part in fine_parts]
+    # The parts used last come last; the first ones are forgotten.
+    _kept_parts[key] = (versions, parts)
     while len(_kept_parts) > _MAX_KEPT_MESHES:
         del _kept_parts[next(iter(_kept_parts))]
     return list(parts)
@@ -407,13 +444,11 @@ def _read_obj_parts(file: Path, factors: Floats, versions: Versions) -> list[Mes
         scene = trimesh.load_scene(
             source, process=False, group_material=True, split_object=False, **settings
         )
-        parts = [
-            MeshPart(
-                np.asarray(mesh.vertices) * factors, np.asarray(mesh.faces), _find_colour(mesh)
-            )
-            for mesh in scene.geometry.values()
-            if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)
-        ]
+        parts = list[MeshPart]()
+        for mesh in scene.geometry.values():
+            if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces):
+                vertices = np.asarray(mesh.vertices) * factors
+                parts.append(MeshPart(vertices, np.asarray(mesh.faces), _find_colour(mesh)))
     except InputError:
         raise
     except Exception as error:
@@ -432,16 +467,17 @@ def simplify_mesh(part: MeshPart, detail: float) -> MeshPart:
     cells = np.round(part.vertices / detail).astype(np.int64)
     _, group, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     group = group.reshape(-1)
-    means = np.zeros((len(count), 3))
-    np.add.at(means, group, part.vertices)
+    sums = np.zeros((len(count), 3))
+    np.add.at(sums, group, part.vertices)
+    means = sums / count[:, None]
     faces = group[part.faces]
-    faces = faces[
-        (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    ]
+    a, b, c = faces.T
+    faces = faces[(a != b) & (b != c) & (c != a)]
     if len(faces) == 0:
         return part
+    # Of triangles with the same corners, the first remains.
     _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-    return MeshPart(means / count[:, None], faces[np.sort(first)], part.colour)
+    return MeshPart(means, faces[np.sort(first)], part.colour)
 
 
 def make_bvh(part: MeshPart | trimesh.Trimesh) -> coal.BVHModelOBBRSS:
@@ -456,9 +492,8 @@ def make_bvh(part: MeshPart | trimesh.Trimesh) -> coal.BVHModelOBBRSS:
 
 def _check_scale(file: Path, scale: ArrayLike) -> Floats:
     factors = np.asarray(scale, float)
-    if factors.shape not in ((), (1,), (3,)) or not (
-        np.isfinite(factors).all() and (factors != 0.0).all()
-    ):
+    has_valid_shape = factors.shape in ((), (1,), (3,))
+    if not has_valid_shape or not np.isfinite(factors).all() or (factors == 0.0).any():
         raise InputError(
             "wrong scale of a mesh",
             file=file,
@@ -471,13 +506,12 @@ def _check_scale(file: Path, scale: ArrayLike) -> Floats:
 
 def get_triangles(shape: coal.Convex | coal.BVHModelBase) -> Ints:
     """Return the vertex indices of the triangles of a coal shape, shape (m, 3)."""
-    convex = isinstance(shape, coal.Convex)
-    count, item = (
-        (shape.num_polygons, shape.polygons) if convex else (shape.num_tris, shape.tri_indices)
-    )
-    return np.array(
-        [[triangle[i] for i in range(3)] for triangle in map(item, range(count))], np.int64
-    ).reshape(-1, 3)
+    if isinstance(shape, coal.Convex):
+        triangles = [shape.polygons(k) for k in range(shape.num_polygons)]
+    else:
+        triangles = [shape.tri_indices(k) for k in range(shape.num_tris)]
+    rows = [(triangle[0], triangle[1], triangle[2]) for triangle in triangles]
+    return np.array(rows, np.int64).reshape(-1, 3)
 
 
 def _find_colour(mesh: trimesh.Trimesh) -> tuple[float, float, float, float] | None:
@@ -499,14 +533,16 @@ def _fix_box_support() -> None:
     larger on their negative sides: they are if a component is zero (a `static` in
     `getShapeSupport`). These queries, without such a component, precede all others.
     """
-    turned = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
+    rotation = np.array([[0.36, 0.48, -0.8], [-0.8, 0.6, 0.0], [0.48, 0.64, 0.6]])
+    placement = coal.Transform3s(rotation, np.array([3.0, 0.4, 0.2]))
+    identity = coal.Transform3s()
     box = coal.Box(1.0, 1.0, 1.0)
-    here = coal.Transform3s()
-    there = coal.Transform3s(turned, np.array([3.0, 0.4, 0.2]))
+    capsule = coal.Capsule(0.1, 0.5)
+    request = coal.DistanceRequest()
+    coal.distance(capsule, identity, box, placement, request, coal.DistanceResult())
     # For the other support function, of shapes with a swept sphere.
     plane = coal.Halfspace(np.array([0.36, 0.48, 0.8]), 0.0)
-    for shape, where in ((coal.Capsule(0.1, 0.5), there), (plane, here)):
-        coal.distance(shape, here, box, where, coal.DistanceRequest(), coal.DistanceResult())
+    coal.distance(plane, identity, box, identity, request, coal.DistanceResult())
 
 
 _fix_box_support()

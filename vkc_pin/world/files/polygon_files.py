@@ -45,15 +45,18 @@ def normalize_obj(data: bytes, file: Path, submesh: str | None) -> bytes:
         file: The file, for messages.
         submesh: Name of an object or group, to keep its faces alone.
     """
-    for old, new in ((b"\r\n", b"\n"), (b"\r", b"\n"), (b"\\\n", b" ")):
-        data = data.replace(old, new)
+    data = data.removeprefix(codecs.BOM_UTF8)
+    data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    data = data.replace(b"\\\n", b" ")
     counts = {b"v": 0, b"vt": 0, b"vn": 0}
     wanted = None if submesh is None else submesh.encode()
-    lines, names = list[bytes](), dict[str, None]()
+    lines = list[bytes]()
+    names = dict[str, None]()
     vertices = list[list[bytes]]()
     polygons = dict[int, list[bytes]]()  # corners of faces with more than three, by line
-    is_kept = is_found = wanted is None
-    for number, line in enumerate(data.removeprefix(codecs.BOM_UTF8).split(b"\n"), 1):
+    is_kept = wanted is None
+    is_found = wanted is None
+    for number, line in enumerate(data.split(b"\n"), 1):
         key, *values = line.split() or [b""]
         if key in (*counts, b"f"):
             values = line.partition(b"#")[0].split()[1:]
@@ -61,10 +64,12 @@ def normalize_obj(data: bytes, file: Path, submesh: str | None) -> bytes:
             counts[key] += 1
             if key == b"v":
                 vertices.append(values[:3])
-        elif key in (b"o", b"g"):  # a group may have several names
-            own = {b" ".join(values), *values}
-            names.update(dict.fromkeys(name.decode(errors="replace") for name in sorted(own)))
-            is_kept = wanted is None or wanted in own
+        elif key in (b"o", b"g"):
+            # A group may have several names.
+            own_names = {b" ".join(values), *values}
+            for name in sorted(own_names):
+                names[name.decode(errors="replace")] = None
+            is_kept = wanted is None or wanted in own_names
         elif key == b"f":
             if not is_kept:
                 continue
@@ -87,9 +92,14 @@ def _count_from_start(corner: bytes, counts: Mapping[bytes, int], file: Path, li
         if text.startswith(b"-"):
             text = b"%d" % (count + 1 + int(text))
         if not indices and int(text) < 1:
-            problem, expected = "no such vertex", f"1 to {count}, or -1 to {-count} from the last"
-            got = corner.decode(errors="replace")
-            raise InputError(problem, file=file, line=line, field="f", expected=expected, got=got)
+            raise InputError(
+                "no such vertex",
+                file=file,
+                line=line,
+                field="f",
+                expected=f"1 to {count}, or -1 to {-count} from the last",
+                got=corner.decode(errors="replace"),
+            )
         indices.append(text)
     return b"/".join(indices)
 
@@ -100,14 +110,18 @@ def _divide_faces(
     """Return the lines of triangles that replace polygons, by the polygon's line."""
     if not polygons:
         return {}
-    places = np.array(vertices, float)
+    positions = np.array(vertices, float)
     divided = dict[int, list[bytes]]()
     for line, corners in polygons.items():
-        used = np.array([int(corner.partition(b"/")[0]) - 1 for corner in corners])
+        indices = np.array([int(corner.partition(b"/")[0]) - 1 for corner in corners])
         # trimesh reports vertices that do not exist.
-        if used.max() < len(places):
-            triangles = triangulate_polygons(places[used], np.arange(len(used))[None])
-            divided[line] = [b"f " + b" ".join(corners[k] for k in face) for face in triangles]
+        if indices.max() >= len(positions):
+            continue
+        triangles = triangulate_polygons(positions[indices], np.arange(len(indices))[None])
+        divided[line] = []
+        for triangle in triangles:
+            triangle_corners = [corners[k] for k in triangle]
+            divided[line].append(b" ".join([b"f", *triangle_corners]))
     return divided
 
 
@@ -123,13 +137,19 @@ def read_off(data: bytes, file: Path) -> tuple[Floats, Ints]:
     if header is None:
         expected = "OFF in its first line"
         raise InputError("this is no OFF file", file=file, expected=expected, got=text[:20])
-    rows = [words for line in text[header.end() :].splitlines() if (words := line.split())]
+    rows = list[list[str]]()
+    for line in text[header.end() :].splitlines():
+        words = line.split()
+        if words:
+            rows.append(words)
+    # The first row has the numbers of vertices and faces, and of edges, which nothing needs.
     vertex_count, face_count = (int(word) for word in rows[0][:2])
-    vertices = np.array([row[:3] for row in rows[1 : 1 + vertex_count]], float)
-    faces = [
-        np.array(row[1 : 1 + int(row[0])], np.int64)
-        for row in rows[1 + vertex_count : 1 + vertex_count + face_count]
-    ]
+    first_face = 1 + vertex_count
+    vertices = np.array([row[:3] for row in rows[1:first_face]], float)
+    faces = list[Ints]()
+    for row in rows[first_face : first_face + face_count]:
+        corner_count = int(row[0])
+        faces.append(np.array(row[1 : 1 + corner_count], np.int64))
     if len(vertices) != vertex_count or len(faces) != face_count:
         raise InputError(
             "wrong number of lines",
@@ -150,10 +170,11 @@ def divide_polygons(vertices: Floats, polygons: Sequence[Ints], file: Path) -> I
     """
     by_count = dict[int, list[Ints]]()
     for polygon in polygons:
-        by_count.setdefault(len(polygon), []).append(polygon)
+        same_count = by_count.setdefault(len(polygon), [])
+        same_count.append(polygon)
     found = [np.empty((0, 3), np.int64)]
-    for same in by_count.values():
-        corners = np.array(same, np.int64)
+    for same_count in by_count.values():
+        corners = np.array(same_count, np.int64)
         outside = corners[(corners < 0) | (corners >= len(vertices))]
         if len(outside):
             expected = f"0 to {len(vertices) - 1}"

@@ -43,35 +43,37 @@ def triangulate_polygon(vertices: Floats, rings: Sequence[Ints]) -> Ints:
         vertices: Shape (n, 3).
         rings: Vertices of the outline, and of each hole.
     """
-    used = np.concatenate(rings)
+    earcut = import_optional("mapbox_earcut", "import", purpose="a mesh of concave polygons")
+    corners = np.concatenate(rings)
     outline = vertices[rings[0]]
-    normal = _compute_area_vectors(outline[None])[0]
+    (normal,) = _compute_area_vectors(outline[None])
     # Of the three coordinate planes, that in which the polygon appears largest.
     largest = int(np.abs(normal).argmax())
     plane = [(largest + 1) % 3, (largest + 2) % 3]
-    flat = np.ascontiguousarray(vertices[used][:, plane], float)
-    ends = np.cumsum([len(ring) for ring in rings]).astype(np.uint32)
-    earcut = import_optional("mapbox_earcut", "import", purpose="a mesh of concave polygons")
-    chosen = earcut.triangulate_float64(flat, ends).reshape(-1, 3).astype(np.int64)
-    areas = _compute_area_vectors(vertices[used[chosen]])
-    is_inverted = areas @ normal < 0.0
-    chosen[is_inverted] = chosen[is_inverted][:, ::-1]
-    return used[chosen]
+    projected = np.ascontiguousarray(vertices[corners][:, plane], float)
+    ring_ends = np.cumsum([len(ring) for ring in rings]).astype(np.uint32)
+    indices = earcut.triangulate_float64(projected, ring_ends)
+    triangles = corners[indices.reshape(-1, 3).astype(np.int64)]
+    area_vectors = _compute_area_vectors(vertices[triangles])
+    is_inverted = area_vectors @ normal < 0.0
+    triangles[is_inverted] = triangles[is_inverted][:, ::-1]
+    return np.asarray(triangles)
 
 
 def _are_convex(polygons: Floats) -> np.ndarray:
     """Return whether polygons, shape (m, c, 3), are convex, shape (m,)."""
     normals = _compute_area_vectors(polygons)
+    straight = -_STRAIGHT * (normals**2).sum(axis=1)[:, None]
     edges = np.roll(polygons, -1, axis=1) - polygons
     turns = np.cross(edges, np.roll(edges, -1, axis=1))
     # Twice the area of the triangle at each corner, as it appears along the polygon's normal
-    heights = np.einsum("mci,mi->mc", turns, normals)
-    squares = (normals**2).sum(axis=1)
-    turns_left = (heights >= -_STRAIGHT * squares[:, None]).all(axis=1)
-    # A pentagram turns left everywhere, too, but twice around.
-    corners = polygons[:, :1]
-    fans = np.cross(polygons[:, 1:-1] - corners, polygons[:, 2:] - corners)
-    is_star_free = (np.einsum("mci,mi->mc", fans, normals) >= -_STRAIGHT * squares[:, None]).all(1)
+    turn_areas = np.einsum("mci,mi->mc", turns, normals)
+    turns_left = (turn_areas >= straight).all(axis=1)
+    # A pentagram turns left everywhere, too, but twice around: its fan about a corner overlaps.
+    first = polygons[:, :1]
+    fans = np.cross(polygons[:, 1:-1] - first, polygons[:, 2:] - first)
+    fan_areas = np.einsum("mci,mi->mc", fans, normals)
+    is_star_free = (fan_areas >= straight).all(axis=1)
     return np.asarray(turns_left & is_star_free)
 
 
@@ -80,5 +82,6 @@ def _compute_area_vectors(polygons: Floats) -> Floats:
 
     Newell's method: the sum of v_k × v_(k+1), about the first corner.
     """
-    around = polygons - polygons[:, :1]
-    return np.asarray(np.cross(around, np.roll(around, -1, axis=1)).sum(axis=1))
+    corners = polygons - polygons[:, :1]
+    next_corners = np.roll(corners, -1, axis=1)
+    return np.asarray(np.cross(corners, next_corners).sum(axis=1))

@@ -17,14 +17,16 @@ import pinocchio as pin
 from vkc_pin.errors import InputError, UnknownNameError, find_nearest_name, format_value
 from vkc_pin.utils.system import is_file
 
-_MAX_NAME_LENGTH = (
-    64  # characters of a file name without extension; file systems take 255 bytes with it
-)
+# Characters of a file name without extension; file systems take 255 bytes with it.
+_MAX_NAME_LENGTH = 64
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):(.*)", re.DOTALL)  # not C:, a drive
 _MODEL_PATHS = ("GZ_SIM_RESOURCE_PATH", "GAZEBO_MODEL_PATH")  # variables with folders of models
 _NO_PACKAGES: Mapping[str, Path] = MappingProxyType({})
+# Sizes of paths and of file names in Linux [bytes]
+_MAX_PATH_SIZE = 4095
+_MAX_PART_SIZE = 255
 _NEAR = 4  # folders above a file whose other folders are searched for a package.xml
-_MAX_HEAD = 20_000  # characters of a package.xml in which its name stands
+_MAX_HEAD = 20_000  # characters of a package.xml that are searched for its name
 _PACKAGE = re.compile(r"(?i:package|model):/*([^/]+)/+(.+)")  # NAME/... in an address
 _PACKAGE_NAME = re.compile(r"<name>\s*([^<\s]+)\s*</name>")
 _FILE_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
@@ -63,10 +65,12 @@ def check_path(value: Any, field: str, expected: str = "a path") -> Path:
         raise InputError("not a path", field=field, expected=expected, got=format_value(value))
     name = str(value)
     try:
-        coded = os.fsencode(name)
+        encoded = os.fsencode(name)
     except UnicodeEncodeError:
-        coded = b""
-    if not coded or b"\0" in coded or len(coded) >= 4096 or max(map(len, coded.split(b"/"))) > 255:
+        encoded = b""
+    longest_part = max(map(len, encoded.split(b"/")))
+    is_too_long = len(encoded) > _MAX_PATH_SIZE or longest_part > _MAX_PART_SIZE
+    if not encoded or b"\0" in encoded or is_too_long:
         raise InputError(
             "no file can be called that", field=field, expected=expected, got=format_value(name)
         )
@@ -88,8 +92,9 @@ def find_example_robot_data() -> Path | None:
     if spec is not None and spec.origin is not None:
         prefixes.append(Path(spec.origin).resolve().parents[1] / "cmeel.prefix")
     for prefix in prefixes:
-        if (prefix / "share" / "example-robot-data" / "robots").is_dir():
-            return prefix / "share" / "example-robot-data"
+        folder = prefix / "share" / "example-robot-data"
+        if (folder / "robots").is_dir():
+            return folder
     return None
 
 
@@ -117,17 +122,20 @@ def find_mesh_file(
         if is_file(candidate):
             return candidate
         first = first or candidate
-    if (match := _PACKAGE.match(unquote(address.strip()))) is not None:
-        place = find_package(match[1], file, packages)  # of another folder name
-        if place is not None and is_file(place / match[2]):
-            return place / match[2]
+    match = _PACKAGE.match(unquote(address.strip()))
+    if match is not None:
+        # The package's folder may have another name.
+        package_name, inside = match.groups()
+        folder = find_package(package_name, file, packages)
+        if folder is not None and is_file(folder / inside):
+            return folder / inside
     assert first is not None  # there is a folder around every file
     expected = "a mesh file"
     with contextlib.suppress(OSError, ValueError):  # there may be no such folder
-        nearest = find_nearest_name(
-            first.name, sorted(item.name for item in first.parent.iterdir())
-        )
-        expected += f", such as {nearest}" if nearest else ""
+        neighbours = sorted(item.name for item in first.parent.iterdir())
+        nearest = find_nearest_name(first.name, neighbours)
+        if nearest:
+            expected += f", such as {nearest}"
     raise InputError(
         "there is no such mesh",
         file=file,
@@ -148,13 +156,21 @@ def iterate_address_candidates(
     """
     text = address.strip()
     match = _SCHEME.fullmatch(text)
-    scheme, rest = (match[1].lower(), match[2]) if match else ("", text)
+    if match:
+        scheme = match[1].lower()
+        rest = match[2]
+    else:
+        scheme = ""
+        rest = text
     if scheme in ("package", "model"):
         found: Iterable[Path] = _list_package_candidates(rest.lstrip("/"), file, packages)
     elif scheme in ("", "file"):
-        if rest.startswith("//"):  # `file://HOST/PATH`; without a host also for relative paths
-            host, slash, path = rest[2:].partition("/")
-            rest = slash + path if host.lower() in ("", "localhost") else rest[2:]
+        # `file://HOST/PATH`; without a host also for relative paths
+        if rest.startswith("//"):
+            rest = rest[2:]
+            host, slash, path = rest.partition("/")
+            if host.lower() in ("", "localhost"):
+                rest = slash + path
         found = [folder / rest for folder in _list_folders(file)]
     elif rest.startswith("//"):
         raise InputError(
@@ -187,16 +203,28 @@ def _list_package_candidates(
     inside = inside.lstrip("/")
     if name in packages:
         yield packages[name] / inside
-    around = dict.fromkeys([*file.absolute().parents, *file.resolve().parents])
-    yield from (folder / name / inside for folder in around)
-    yield from (folder / inside for folder in around if inside)
-    yield from (folder / "models" / name / inside for folder in around)
+    around = _list_folders_above(file)
+    for folder in around:
+        yield folder / name / inside
+    if inside:
+        for folder in around:
+            yield folder / inside
+    for folder in around:
+        yield folder / "models" / name / inside
     for variable in _MODEL_PATHS:
-        for folder in filter(None, os.environ.get(variable, "").split(os.pathsep)):
-            yield Path(folder) / name / inside
-    # for copies of its URDFs, wherever they are
-    if name == "example-robot-data" and (data := find_example_robot_data()) is not None:
-        yield data / inside
+        for model_folder in os.environ.get(variable, "").split(os.pathsep):
+            if model_folder:
+                yield Path(model_folder) / name / inside
+    # Copies of the URDFs of example-robot-data may be anywhere.
+    if name == "example-robot-data":
+        data = find_example_robot_data()
+        if data is not None:
+            yield data / inside
+
+
+def _list_folders_above(file: Path) -> list[Path]:
+    """Return the folders around a file, and around its target if it is a link, from inside out."""
+    return list(dict.fromkeys([*file.absolute().parents, *file.resolve().parents]))
 
 
 def find_package(
@@ -209,19 +237,22 @@ def find_package(
     """
     if packages and name in packages:
         return Path(packages[name])
-    around = list(dict.fromkeys([*file.absolute().parents, *file.resolve().parents]))
+    around = _list_folders_above(file)
     for folder in around:
-        for place in (folder, folder / name) if folder.name == name else (folder / name,):
-            if os.path.isdir(place):  # noqa: PTH112 - its name may be too long
-                return place
+        candidates = [folder / name]
+        if folder.name == name:
+            candidates.insert(0, folder)
+        for candidate in candidates:
+            if os.path.isdir(candidate):  # noqa: PTH112 - its name may be too long
+                return candidate
     for folder in around:
         if _read_package_name(folder) == name:
             return folder
     for folder in around[:_NEAR]:
         with contextlib.suppress(OSError):
-            for place in sorted(folder.iterdir()):
-                if place.is_dir() and _read_package_name(place) == name:
-                    return place
+            for candidate in sorted(folder.iterdir()):
+                if candidate.is_dir() and _read_package_name(candidate) == name:
+                    return candidate
     return None
 
 
@@ -251,7 +282,8 @@ def choose_file_names(
         taken: Existing file names in the folder.
     """
     given = list(names)
-    used, numbers = {name.lower() for name in taken}, dict[str, int]()
+    used = {name.lower() for name in taken}
+    numbers = dict[str, int]()
     chosen: dict[int, str] = {}
     for index, name in enumerate(given):
         if _is_file_name(name) and name.lower() not in used:
@@ -261,10 +293,12 @@ def choose_file_names(
         if index in chosen:
             continue
         stem = name if _is_file_name(name) else _replace_characters(name, fallback)
-        new, number = stem, numbers.get(stem.lower(), 1)
+        new = stem
+        number = numbers.get(stem.lower(), 1)
         while new.lower() in used:
             number += 1
-            new = f"{stem[: _MAX_NAME_LENGTH - 1 - len(str(number))]}_{number}"
+            ending = f"_{number}"
+            new = stem[: _MAX_NAME_LENGTH - len(ending)] + ending
         numbers[stem.lower()] = number
         chosen[index] = new
         used.add(new.lower())

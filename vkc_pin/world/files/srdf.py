@@ -95,8 +95,8 @@ class Srdf:
         States of the group that is planned come first; see `find_states`.
         """
         states = self.find_states(joints, group)
-        own = {state.name for state in self.states if state.group == group} & states.keys()
-        names = [name for name in states if not own or name in own]
+        own_names = {state.name for state in self.states if state.group == group}
+        names = [name for name in states if name in own_names] or list(states)
         for home in (*_HOMES, *names):
             if home in names:
                 return states[home]
@@ -107,33 +107,35 @@ def _choose_positions(
     states: Sequence[SrdfState], joints: Collection[str], group: str | None
 ) -> dict[str, float]:
     """Return the positions of joints in states of one name, or {}; the first states count most."""
-    parts = [
-        {joint: state.positions[joint] for joint in joints if joint in state.positions}
-        for state in states
-    ]
+    parts = [_select_positions(state, joints) for state in states]
     is_own = bool(states) and group is not None and states[0].group == group
     if not is_own:
-        complete = [part for part in parts if part.keys() >= set(joints)]
-        if complete:
-            return complete[0]
+        for part in parts:
+            if part.keys() >= set(joints):
+                return part
     merged: dict[str, float] = {}
     for part in parts:
-        if all(merged.get(joint, value) == value for joint, value in part.items()):
-            merged |= part
+        agrees = all(merged.get(joint, value) == value for joint, value in part.items())
+        if agrees:
+            merged.update(part)
         elif not is_own:
             return {}
     return merged if is_own or merged.keys() >= set(joints) else {}
 
 
+def _select_positions(state: SrdfState, joints: Collection[str]) -> dict[str, float]:
+    return {joint: state.positions[joint] for joint in joints if joint in state.positions}
+
+
 def find_srdf(file: Path) -> Path | None:
     """Return the SRDF of a robot's or home's file by its name, beside it or in ../srdf, or None."""
-    name = file.name.split(".")[0]
-    places = [
-        folder / f"{stem}.srdf"
-        for stem in dict.fromkeys((file.stem, name, name.removesuffix("_robot")))
-        for folder in (file.parent, file.parent.parent / "srdf")
-    ]
-    return next((place for place in places if place.is_file()), None)
+    name, _, _ = file.name.partition(".")
+    for stem in (file.stem, name, name.removesuffix("_robot")):
+        for folder in (file.parent, file.parent.parent / "srdf"):
+            candidate = folder / f"{stem}.srdf"
+            if candidate.is_file():
+                return candidate
+    return None
 
 
 def read_srdf(path: str | Path, urdf: ElementTree.Element) -> Srdf:
@@ -159,17 +161,13 @@ def read_srdf(path: str | Path, urdf: ElementTree.Element) -> Srdf:
     pairs = _read_pairs(root, [tree.links])
     virtual_joints = {element.get("name", "").strip() for element in root.findall("virtual_joint")}
     groups = _GroupReader(root, tree)
-    states, stateless = _read_states(root, tree)
-    unknown_joints = dict.fromkeys((*groups.unknown_joints, *stateless)).keys() - virtual_joints
-    skipped = {
-        "links": dict.fromkeys((*pairs.unknown, *groups.unknown_links)),
-        "joints": sorted(unknown_joints),
-    }
-    notes = [
-        f"skipped {kind} that the robot does not have: {format_names(names)}"
-        for kind, names in skipped.items()
-        if names
-    ]
+    states, unknown_in_states = _read_states(root, tree)
+    unknown_links = dict.fromkeys((*pairs.unknown, *groups.unknown_links))
+    unknown_joints = {*groups.unknown_joints, *unknown_in_states} - virtual_joints
+    notes = list[str]()
+    for kind, names in (("links", list(unknown_links)), ("joints", sorted(unknown_joints))):
+        if names:
+            notes.append(f"skipped {kind} that the robot does not have: {format_names(names)}")
     if groups.invalid:
         notes.append(f"skipped groups of groups that are missing: {format_names(groups.invalid)}")
     return Srdf(pairs.allowed, states, groups.groups, tuple(notes))
@@ -177,8 +175,11 @@ def read_srdf(path: str | Path, urdf: ElementTree.Element) -> Srdf:
 
 def _find_link_references(root: ElementTree.Element) -> set[str]:
     """Return all names of links in an SRDF."""
-    names = {element.get(key, "") for element in root.iter() for key in _LINK_ATTRIBUTES}
-    names |= {element.get("name", "") for element in root.iter("link")}
+    names = set[str]()
+    for element in root.iter():
+        names.update(element.get(key, "") for key in _LINK_ATTRIBUTES)
+    for element in root.iter("link"):
+        names.add(element.get("name", ""))
     return {name.strip() for name in names} - {""}
 
 
@@ -190,7 +191,8 @@ def read_allowed_pairs(path: str | Path, models: Sequence[Collection[str]]) -> A
         models: Names of the links of each model. `<disable_default_collisions>` of a link concerns
             its pairs with links of the same model.
     """
-    return _read_pairs(read_xml(path, "SRDF")[1], models)
+    _, root = read_xml(path, "SRDF")
+    return _read_pairs(root, models)
 
 
 def _read_pairs(root: ElementTree.Element, models: Sequence[Collection[str]]) -> AllowedPairs:
@@ -199,20 +201,21 @@ def _read_pairs(root: ElementTree.Element, models: Sequence[Collection[str]]) ->
     As in MoveIt, `<disable_default_collisions>` allows all pairs of a link, `<enable_collisions>`
     checks some of these nevertheless, and `<disable_collisions>` allows a pair in any case.
     """
-    known = {link for model in models for link in model}
+    known = set[str]().union(*models)
     unknown: dict[str, int | None] = {}
     allowed: dict[Pair, str] = {}
     for element in root.findall("disable_default_collisions"):
         link = element.get("link", "").strip()
         if link not in known:
             unknown.setdefault(link, find_line(element))
-            continue
         for model in models:
-            others = (other for other in model if other != link and link in model)
-            allowed.update((_sort_pair(link, other), "Default") for other in others)
+            if link in model:
+                pairs = [_sort_pair(link, other) for other in model if other != link]
+                allowed.update(dict.fromkeys(pairs, "Default"))
     for tag in ("enable_collisions", "disable_collisions"):
         for element in root.findall(tag):
-            one, other = (element.get(key, "").strip() for key in ("link1", "link2"))
+            one = element.get("link1", "").strip()
+            other = element.get("link2", "").strip()
             missing = [name for name in (one, other) if name not in known]
             for name in missing:
                 unknown.setdefault(name, find_line(element))
@@ -230,29 +233,36 @@ class _Tree:
     """Links and joints of a URDF."""
 
     def __init__(self, urdf: ElementTree.Element) -> None:
-        self.links = dict.fromkeys(link.get("name", "") for link in urdf.findall("link")).keys()
-        self.moved: dict[str, str] = {}  # joint → its child link
-        self.above: dict[str, tuple[str, str]] = {}  # child link → its joint and parent link
+        names = [link.get("name", "") for link in urdf.findall("link")]
+        self.links = dict.fromkeys(names).keys()
+        self.child_links = dict[str, str]()  # joint → its child link
+        self.parent_joints = dict[str, str]()  # link → the joint that carries it
+        self.parent_links = dict[str, str]()  # link → the link that carries it
         for joint in urdf.findall("joint"):
-            ends = [joint.find(key) for key in ("parent", "child")]
-            parent, child = (end.get("link", "") if end is not None else "" for end in ends)
             name = joint.get("name", "")
-            self.moved[name] = child
-            self.above[child] = (name, parent)
+            parent = joint.find("parent")
+            child = joint.find("child")
+            parent_link = "" if parent is None else parent.get("link", "")
+            child_link = "" if child is None else child.get("link", "")
+            self.child_links[name] = child_link
+            self.parent_joints[child_link] = name
+            self.parent_links[child_link] = parent_link
 
     def list_ancestors(self, link: str) -> list[str]:
         """Return a link and those above it, up to the root."""
         found = [link]
-        while found[-1] in self.above and len(found) <= len(self.links):
-            found.append(self.above[found[-1]][1])
+        # The number of links ends circles.
+        while found[-1] in self.parent_links and len(found) <= len(self.links):
+            found.append(self.parent_links[found[-1]])
         return found
 
     def find_chain(self, base: str, tip: str) -> list[str]:
         """Return the joints between two links, by their nearest common ancestor."""
-        from_base, from_tip = self.list_ancestors(base), self.list_ancestors(tip)
-        apart = [link for link in from_base if link not in from_tip]
-        apart += [link for link in reversed(from_tip) if link not in from_base]
-        return [self.above[link][0] for link in apart if link in self.above]
+        from_base = self.list_ancestors(base)
+        from_tip = self.list_ancestors(tip)
+        links = [link for link in from_base if link not in from_tip]
+        links += [link for link in reversed(from_tip) if link not in from_base]
+        return [self.parent_joints[link] for link in links if link in self.parent_joints]
 
 
 class _GroupReader:
@@ -271,26 +281,26 @@ class _GroupReader:
         self.unknown_links = dict[str, None]()
         self.unknown_joints = dict[str, None]()
         waiting = {element.get("name", "").strip(): element for element in root.findall("group")}
-        moved_by_group: dict[str, dict[str, str]] = {}
+        moved_by_group = dict[str, dict[str, str]]()  # group → its joints → their child links
         while True:
-            ready = [
-                name
-                for name, element in waiting.items()
-                if moved_by_group.keys() >= set(_read_names(element, "group"))
-            ]
+            ready = list[str]()
+            for name, element in waiting.items():
+                parts = _read_names(element, "group")
+                if moved_by_group.keys() >= set(parts):
+                    ready.append(name)
             if not ready:
                 break
             for name in ready:
                 element = waiting.pop(name)
-                moved_by_group[name] = self._find_moved_links(element)
+                moved = self._find_moved_links(element)
                 for part in _read_names(element, "group"):
-                    moved_by_group[name] |= moved_by_group[part]
+                    moved.update(moved_by_group[part])
+                moved_by_group[name] = moved
         self.invalid = list(waiting)
-        self.groups = {
-            name: SrdfGroup(tuple(moved), self._find_tip(moved))
-            for name, moved in moved_by_group.items()
-            if moved
-        }
+        self.groups = dict[str, SrdfGroup]()
+        for name, moved in moved_by_group.items():
+            if moved:
+                self.groups[name] = SrdfGroup(tuple(moved), self._find_tip(moved))
 
     def _find_moved_links(self, group: ElementTree.Element) -> dict[str, str]:
         """Return the joints of a group with the links that they move, without other groups."""
@@ -299,19 +309,21 @@ class _GroupReader:
         for link in _read_names(group, "link"):
             if link not in tree.links:
                 self.unknown_links[link] = None
-            elif link in tree.above:  # the root has no parent joint
-                moved[tree.above[link][0]] = link
+            elif link in tree.parent_joints:  # the root has none
+                moved[tree.parent_joints[link]] = link
         for joint in _read_names(group, "joint"):
-            if joint in tree.moved:
-                moved[joint] = tree.moved[joint]
+            if joint in tree.child_links:
+                moved[joint] = tree.child_links[joint]
             else:
                 self.unknown_joints[joint] = None
         for chain in group.findall("chain"):
-            ends = [chain.get(key, "").strip() for key in ("base_link", "tip_link")]
-            missing = [link for link in ends if link not in tree.links]
+            base = chain.get("base_link", "").strip()
+            tip = chain.get("tip_link", "").strip()
+            missing = [link for link in (base, tip) if link not in tree.links]
             self.unknown_links.update(dict.fromkeys(missing))
             if not missing:
-                moved |= {joint: tree.moved[joint] for joint in tree.find_chain(*ends)}
+                for joint in tree.find_chain(base, tip):
+                    moved[joint] = tree.child_links[joint]
         return moved
 
     def _find_tip(self, moved: Mapping[str, str]) -> str:
@@ -328,21 +340,24 @@ def _read_states(
     root: ElementTree.Element, tree: _Tree
 ) -> tuple[tuple[SrdfState, ...], dict[str, None]]:
     """Return the states of groups, and names in them that are no joints."""
-    states, unknown = list[SrdfState](), dict[str, None]()
+    states = list[SrdfState]()
+    unknown = dict[str, None]()
     for element in root.findall("group_state"):
         positions: dict[str, float] = {}
         for joint in element.findall("joint"):
-            name = joint.get("name", "").strip()
-            if name not in tree.moved:
-                unknown[name] = None
+            joint_name = joint.get("name", "").strip()
+            if joint_name not in tree.child_links:
+                unknown[joint_name] = None
                 continue
+            # Joints of several coordinates have several numbers, and are not planned.
             try:
                 position = float(joint.get("value", ""))
             except ValueError:
-                continue  # joints of several coordinates: not ours
+                continue
             if math.isfinite(position):
-                positions[name] = position
-        name, group = (element.get(key, "").strip() for key in ("name", "group"))
+                positions[joint_name] = position
+        name = element.get("name", "").strip()
+        group = element.get("group", "").strip()
         states.append(SrdfState(name, group, positions))
     return tuple(states), unknown
 
@@ -354,4 +369,6 @@ def _sort_pair(one: str, other: str) -> Pair:
 def format_names(names: Collection[str]) -> str:
     """Return names as text; "" is an attribute that is missing."""
     listed = ", ".join(name or '""' for name in list(names)[:_LISTED])
-    return listed + (f", ... ({len(names)})" if len(names) > _LISTED else "")
+    if len(names) > _LISTED:
+        listed += f", ... ({len(names)})"
+    return listed

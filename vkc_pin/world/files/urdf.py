@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 Colour = tuple[float, float, float, float]
 _LIGHT_GREY: Colour = (0.9, 0.9, 0.9, 1.0)
-# shapes of a kind that become one model: Pinocchio's take the third power of their number in time
-# to grow
+# Shapes of a kind that become one model: the time in which Pinocchio's models grow is proportional
+# to the third power of their number.
 _MAX_SHAPES = 1000
 _JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed")
 
@@ -77,15 +77,16 @@ class UrdfShape:
         elif self.kind == "box":
             mesh = trimesh.creation.box(self.size)
         elif self.kind == "sphere":
-            mesh = trimesh.creation.icosphere(subdivisions=3, radius=1.005 * self.size[0])
-        elif self.kind == "capsule":
-            mesh = trimesh.creation.capsule(
-                height=self.size[1], radius=self.size[0] / np.cos(np.pi / 64), count=[64, 64]
-            )
+            (radius,) = self.size
+            mesh = trimesh.creation.icosphere(subdivisions=3, radius=1.005 * radius)
         else:
-            mesh = trimesh.creation.cylinder(
-                self.size[0] / np.cos(np.pi / 64), height=self.size[1], sections=64
-            )
+            radius, length = self.size
+            # Sides of the polygon touch the circle.
+            corner_radius = radius / np.cos(np.pi / 64)
+            if self.kind == "capsule":
+                mesh = trimesh.creation.capsule(height=length, radius=corner_radius, count=[64, 64])
+            else:
+                mesh = trimesh.creation.cylinder(corner_radius, height=length, sections=64)
         return mesh.apply_transform(self.placement.homogeneous)
 
 
@@ -109,17 +110,18 @@ class UrdfFile:
 
     def read_shapes(self, kind: str) -> list[UrdfShape]:
         """Return all elements of `kind`, "visual" or "collision"."""
-        colours = {
-            material.get("name", ""): colour
-            for material in reversed(list(self.root.iter("material")))  # the first of a name counts
-            if (colour := self._colour(material))
-        }
-        found = []
+        colours = dict[str, Colour]()
+        # Of several materials of one name, the first one counts.
+        for material in reversed(list(self.root.iter("material"))):
+            colour = self._read_colour(material)
+            if colour is not None:
+                colours[material.get("name", "")] = colour
+        shapes = []
         for link in self.root.findall("link"):
             name = link.get("name", "")
             for index, element in enumerate(link.findall(kind)):
-                found.append(self._shape(name, f"{name}_{index}", element, colours))
-        return found
+                shapes.append(self._read_shape(name, f"{name}_{index}", element, colours))
+        return shapes
 
     def read_shapes_for_model(self, kind: str) -> list[UrdfShape]:
         """Return the elements of a kind for one model; see `read_shapes`."""
@@ -137,11 +139,11 @@ class UrdfFile:
         """Return the file of a mesh's address; see `find_mesh_file`."""
         return find_mesh_file(address, self.path, self.packages)
 
-    def _shape(
+    def _read_shape(
         self, link: str, name: str, element: ElementTree.Element, colours: Mapping[str, Colour]
     ) -> UrdfShape:
         geometry = element.find("geometry")
-        shape = next(iter(geometry), None) if geometry is not None else None
+        shape = None if geometry is None else geometry.find("*")
         if shape is None:
             raise make_element_error(
                 self.path,
@@ -153,35 +155,32 @@ class UrdfFile:
         origin = element.find("origin")
         placement = pin.SE3.Identity()
         if origin is not None:
-            position = self._numbers(origin, "xyz", 3, "0 0 0", name)
-            angles = self._numbers(origin, "rpy", 3, "0 0 0", name)
+            position = self._parse_numbers(origin, "xyz", 3, "0 0 0", name)
+            angles = self._parse_numbers(origin, "rpy", 3, "0 0 0", name)
             placement = pin.SE3(_compute_rotation(*angles), np.array(position))
+        colour = None
         material = element.find("material")
-        colour = (
-            None
-            if material is None
-            else self._colour(material) or colours.get(material.get("name", ""))
-        )
+        if material is not None:
+            colour = self._read_colour(material) or colours.get(material.get("name", ""))
         if shape.tag == "mesh":
             file = self.resolve(shape.get("filename", ""))
-            scale = self._numbers(shape, "scale", 3, "1 1 1", name)
+            scale = self._parse_numbers(shape, "scale", 3, "1 1 1", name)
             return UrdfShape(link, name, placement, "mesh", scale, file=file, colour=colour)
         if shape.tag == "box":
-            size = self._numbers(shape, "size", 3, None, name)
+            size = self._parse_numbers(shape, "size", 3, None, name)
         elif shape.tag == "sphere":
-            size = self._numbers(shape, "radius", 1, None, name)
+            size = self._parse_numbers(shape, "radius", 1, None, name)
         elif shape.tag in ("cylinder", "capsule"):
-            size = self._numbers(shape, "radius", 1, None, name) + self._numbers(
-                shape, "length", 1, None, name
-            )
+            radius = self._parse_numbers(shape, "radius", 1, None, name)
+            length = self._parse_numbers(shape, "length", 1, None, name)
+            size = radius + length
         else:
-            known = "box, sphere, cylinder, capsule or mesh"
             raise make_element_error(
                 self.path,
                 element,
                 "this shape is not supported",
                 field=name,
-                expected=known,
+                expected="box, sphere, cylinder, capsule or mesh",
                 got=shape.tag,
             )
         if min(size) <= 0.0:
@@ -195,16 +194,15 @@ class UrdfFile:
             )
         return UrdfShape(link, name, placement, shape.tag, size, colour=colour)
 
-    def _colour(self, material: ElementTree.Element) -> Colour | None:
+    def _read_colour(self, material: ElementTree.Element) -> Colour | None:
         colour = material.find("color")
         if colour is None or colour.get("rgba") is None:
             return None
-        red, green, blue, opacity = self._numbers(
-            colour, "rgba", 4, None, material.get("name", "material")
-        )
+        name = material.get("name", "material")
+        red, green, blue, opacity = self._parse_numbers(colour, "rgba", 4, None, name)
         return (red, green, blue, opacity)
 
-    def _numbers(
+    def _parse_numbers(
         self, element: ElementTree.Element, key: str, count: int, default: str | None, where: str
     ) -> tuple[float, ...]:
         return parse_numbers(self.path, element, key, count, default=default, where=where)
@@ -233,15 +231,16 @@ def build_model(file: UrdfFile, *root: pin.JointModelPlanar | str) -> pin.Model:
         file: The URDF.
         *root: A joint that carries the root link, and its name. Default: the root link is fixed.
     """
-    text, silent = simplify_tree(file.path, file.root)
+    text, without_velocity = simplify_tree(file.path, file.root)
     try:
         model = pin.buildModelFromXML(text, *root)
     except (ValueError, RuntimeError) as error:
         raise InputError(f"not a valid URDF: {error}", file=file.path) from error
     velocity = model.velocityLimit
     for j in range(1, model.njoints):
-        if model.names[j] in silent:
-            velocity[model.joints[j].idx_v : model.joints[j].idx_v + model.joints[j].nv] = np.inf
+        if model.names[j] in without_velocity:
+            joint = model.joints[j]
+            velocity[joint.idx_v : joint.idx_v + joint.nv] = np.inf
     model.velocityLimit = velocity
     return model
 
@@ -259,11 +258,14 @@ def load_urdf(
     """
     file = read_urdf(path, text=text)
     for joint in file.root.findall("joint"):
-        name, kind = joint.get("name"), joint.get("type")
+        name = joint.get("name")
+        kind = joint.get("type")
         if kind not in _JOINT_TYPES:
-            problem, expected = "this joint type is not supported", ", ".join(_JOINT_TYPES)
+            problem = "this joint type is not supported"
+            expected = ", ".join(_JOINT_TYPES)
             raise make_element_error(path, joint, problem, field=name, expected=expected, got=kind)
-        if joint.find("mimic") is not None:  # Pinocchio's parser would let it move on its own
+        # Pinocchio's parser would let it move on its own.
+        if joint.find("mimic") is not None:
             problem = "joints that mimic others are not supported"
             raise make_element_error(path, joint, problem, field=name, expected="no <mimic>")
     model = build_model(file)
@@ -281,34 +283,42 @@ def load_urdf(
 
 def _build_geometry(model: pin.Model, file: UrdfFile, kind: str) -> pin.GeometryModel:
     """Return the "visual" or "collision" shapes in the order of the model's frames."""
+
+    def find_frame(shape: UrdfShape) -> int:
+        return int(model.getFrameId(shape.link, pin.FrameType.BODY))
+
     geometry = pin.GeometryModel()
-    shapes = [
-        (model.getFrameId(shape.link, pin.FrameType.BODY), shape)
-        for shape in file.read_shapes_for_model(kind)
-    ]
-    for index, shape in sorted(shapes, key=lambda pair: pair[0]):
-        frame = model.frames[index]
-        solid = (
-            make_bvh(load_mesh(shape.file, shape.size))
-            if kind == "visual" and shape.file is not None
-            else shape.make_solid()
-        )
-        added = pin.GeometryObject(
-            shape.name, frame.parentJoint, index, frame.placement * shape.placement, solid
-        )
+    for shape in sorted(file.read_shapes_for_model(kind), key=find_frame):
+        index = find_frame(shape)
+        link = model.frames[index]
+        if kind == "visual" and shape.file is not None:
+            solid = make_bvh(load_mesh(shape.file, shape.size))
+        else:
+            solid = shape.make_solid()
+        placement = link.placement * shape.placement
+        added = pin.GeometryObject(shape.name, link.parentJoint, index, placement, solid)
         added.meshColor = np.array(shape.colour or _LIGHT_GREY)
         added.overrideMaterial = shape.colour is not None
-        if shape.file is not None:  # viewers draw the file
-            added.meshPath, added.meshScale = str(shape.file), np.array(shape.size)
+        # Viewers draw the file.
+        if shape.file is not None:
+            added.meshPath = str(shape.file)
+            added.meshScale = np.array(shape.size)
         geometry.addGeometryObject(added)
     return geometry
 
 
 def _compute_rotation(roll: float, pitch: float, yaw: float) -> Floats:
-    """Return the rotation of fixed-axis angles [rad], equal to Pinocchio's parser bit for bit."""
-    (a, u), (b, v), (c, w) = (
-        (math.sin(angle / 2.0), math.cos(angle / 2.0)) for angle in (roll, pitch, yaw)
-    )
+    """Return the rotation of fixed-axis angles [rad], equal to Pinocchio's parser bit for bit.
+
+    It is the quaternion s + x i + y j + z k, the product of (w + c k), (v + b j) and (u + a i) with
+    the sines a, b, c and the cosines u, v, w of half of roll, pitch and yaw.
+    """
+    a = math.sin(roll / 2.0)
+    b = math.sin(pitch / 2.0)
+    c = math.sin(yaw / 2.0)
+    u = math.cos(roll / 2.0)
+    v = math.cos(pitch / 2.0)
+    w = math.cos(yaw / 2.0)
     x = a * v * w - u * b * c
     y = u * b * w + a * v * c
     z = u * v * c - a * b * w

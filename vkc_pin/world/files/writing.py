@@ -53,15 +53,17 @@ def check_writable(path: str | Path, *, field: str | None = None) -> Path:
     """Return the target of `write_atomically`."""
     with _report_path_errors(path, field):
         target, _ = _resolve_target(path)
-        place, missing = target.parent, [target.name]
-        while not place.exists():
-            missing.append(place.name)
-            place = place.parent
-        for name in missing:  # no file system takes any name
+        folder = target.parent
+        missing = [target.name]
+        while not folder.exists():
+            missing.append(folder.name)
+            folder = folder.parent
+        # File systems raise other errors for names that they do not take.
+        for name in missing:
             with contextlib.suppress(FileNotFoundError):
-                (place / name).lstat()
+                (folder / name).lstat()
         # Only trying tells whether a disk is read-only, say.
-        temporary = _make_temporary_path(place)
+        temporary = _make_temporary_path(folder)
         with defer_interrupt():
             try:
                 temporary.open("xb").close()
@@ -79,31 +81,31 @@ def check_outputs(
         files: Option or argument → output file.
         inputs: Option or argument → input file, which must not be written.
     """
-    taken = {
-        Path(os.path.realpath(check_path(path, field))): field
-        for field, path in (inputs or {}).items()
-    }
-    targets: dict[Path, str] = {}
+    taken = dict[Path, str]()
+    for field, path in (inputs or {}).items():
+        source = Path(os.path.realpath(check_path(path, field)))
+        taken[source] = field
+    targets = dict[Path, str]()
     for field, path in files.items():
         target = check_writable(path, field=field)
-        if (other := {**taken, **targets}.get(target)) is not None:
+        if target in taken:
             raise InputError(
                 "this file is named twice",
                 file=path,
                 field=field,
-                expected=f"another file than {other}",
+                expected=f"another file than {taken[target]}",
             )
+        taken[target] = field
         targets[target] = field
     for target, field in targets.items():
-        if (
-            above := next((place for place in target.parents if place in targets), None)
-        ) is not None:
-            raise InputError(
-                "a file cannot be a folder",
-                file=above,
-                field=field,
-                got=f"the file of {targets[above]}",
-            )
+        for folder in target.parents:
+            if folder in targets:
+                raise InputError(
+                    "a file cannot be a folder",
+                    file=folder,
+                    field=field,
+                    got=f"the file of {targets[folder]}",
+                )
 
 
 def check_name(name: object, field: str, *, file: str | Path | None = None) -> str:
@@ -114,22 +116,24 @@ def check_name(name: object, field: str, *, file: str | Path | None = None) -> s
         field: Field or argument of the name, for the error.
         file: File of the name, for the error.
     """
-    plain = isinstance(name, str) and name.isprintable() and not {"/", "\\"} & set(name)
-    if (
-        isinstance(name, str)
-        and plain
-        and 0 < len(name.encode()) <= _MAX_NAME_LENGTH
-        and name[0] != "."
-    ):
+    if isinstance(name, str) and _is_plain_name(name):
         return name
     expected = f"at most {_MAX_NAME_LENGTH} bytes of text without slashes, not beginning with a dot"
-    problem, got = "not a plain file name", format_value(name)
-    raise InputError(problem, file=file, field=field, expected=expected, got=got)
+    got = format_value(name)
+    raise InputError("not a plain file name", file=file, field=field, expected=expected, got=got)
+
+
+def _is_plain_name(name: str) -> bool:
+    has_slash = "/" in name or "\\" in name
+    if not name.isprintable() or has_slash or name.startswith("."):
+        return False
+    return 0 < len(name.encode()) <= _MAX_NAME_LENGTH
 
 
 def check_inside(path: str | Path, folder: str | Path) -> None:
     """Check that a path in a folder is not a symbolic link to a place outside."""
-    root, target = (Path(os.path.realpath(place)) for place in (folder, path))
+    root = Path(os.path.realpath(folder))
+    target = Path(os.path.realpath(path))
     if not target.is_relative_to(root):
         expected = f"a path inside {root}"
         raise InputError(
@@ -153,33 +157,38 @@ def is_leftover(path: Path) -> bool:
 def remove_leftovers(folder: str | Path) -> None:
     """Remove temporary files and folders of killed runs; no other run may be writing the folder."""
     with _report_path_errors(folder):
-        for place, folders, files in os.walk(folder):
-            for name in filter(_LEFTOVER.fullmatch, files):
-                Path(place, name).unlink(missing_ok=True)
-            for name in filter(_LEFTOVER.fullmatch, folders):
-                if not Path(place, name).is_symlink():
-                    shutil.rmtree(Path(place, name), ignore_errors=True)
+        for parent, folder_names, file_names in os.walk(folder):
+            for name in filter(_LEFTOVER.fullmatch, file_names):
+                Path(parent, name).unlink(missing_ok=True)
+            for name in filter(_LEFTOVER.fullmatch, folder_names):
+                leftover = Path(parent, name)
+                if not leftover.is_symlink():
+                    shutil.rmtree(leftover, ignore_errors=True)
 
 
 def check_replaceable(folder: str | Path) -> None:
     """Check that all files in a folder were written by `write_folder_atomically`."""
     with _report_path_errors(folder):
         found = {os.path.relpath(entry.path, folder) for entry in _walk_files(folder)}
-    if others := sorted(found - {MANIFEST} - _read_manifest(Path(folder))):
-        more = f" and {len(others) - _MAX_LISTED} more" if len(others) > _MAX_LISTED else ""
+    others = sorted(found - {MANIFEST} - _read_manifest(Path(folder)))
+    if others:
+        names = ", ".join(others[:_MAX_LISTED])
+        if len(others) > _MAX_LISTED:
+            names += f" and {len(others) - _MAX_LISTED} more"
         raise InputError(
             "the folder has files that vkc-pin did not write, and would delete",
             file=folder,
             expected="a folder without them: move them elsewhere",
-            got=f"{', '.join(others[:_MAX_LISTED])}{more}",
+            got=names,
         )
 
 
 def _read_manifest(folder: Path) -> set[str]:
     """Return the files that a folder's manifest lists; none if there is no valid manifest."""
+    path = folder / MANIFEST
     try:
-        files = parse_json(read_text(folder / MANIFEST, "JSON"), folder / MANIFEST)["files"]
-        return {name for name in files if isinstance(name, str)}
+        manifest = parse_json(read_text(path, "JSON"), path)
+        return {name for name in manifest["files"] if isinstance(name, str)}
     except (InputError, LookupError, TypeError):
         return set()
 
@@ -241,14 +250,19 @@ def write_folder_atomically(
 
 def _rename_files(error: InputError, pattern: re.Pattern[str], name: str) -> None:
     """Replace file names, also with lines, in an error."""
-    error.args = tuple(pattern.sub(lambda _: name, str(part)) for part in error.args)
-    error.problem = pattern.sub(lambda _: name, error.problem)
+
+    def rename(text: str) -> str:
+        # A function, since a text would be a template with escapes.
+        return pattern.sub(lambda _: name, text)
+
+    error.args = tuple(rename(str(part)) for part in error.args)
+    error.problem = rename(error.problem)
     if error.file is not None:
-        old = str(error.file)
-        new = pattern.sub(lambda _: name, old)
-        error.file = type(error.file)(new)
-        if new == name:
-            error.line = None  # it counts lines of the other file
+        renamed = rename(str(error.file))
+        error.file = type(error.file)(renamed)
+        # The line is one of the other file.
+        if renamed == name:
+            error.line = None
 
 
 def _check_target(target: Path, path: str | Path, force: bool) -> None:
@@ -264,9 +278,11 @@ def _check_target(target: Path, path: str | Path, force: bool) -> None:
 
 
 def _write_manifest(folder: Path) -> None:
-    (folder / MANIFEST).unlink(missing_ok=True)
+    path = folder / MANIFEST
+    path.unlink(missing_ok=True)
     files = sorted(os.path.relpath(entry.path, folder) for entry in _walk_files(folder))
-    (folder / MANIFEST).write_text(json.dumps({"files": files}, indent=1) + "\n", encoding="utf-8")
+    text = json.dumps({"files": files}, indent=1) + "\n"
+    path.write_text(text, encoding="utf-8")
 
 
 def _replace_folder(target: Path, staging: Path) -> None:
@@ -294,13 +310,20 @@ def _resolve_target(path: str | Path) -> tuple[Path, int | None]:
             raise IsADirectoryError("a folder") from None
         return target, None
     if not stat.S_ISREG(found.st_mode):
-        kinds = {stat.S_ISDIR: "a folder", stat.S_ISFIFO: "a pipe", stat.S_ISSOCK: "a socket"}
-        raise IsADirectoryError(
-            next((name for is_kind, name in kinds.items() if is_kind(found.st_mode)), "a device")
-        )
+        raise IsADirectoryError(_describe_special_file(found.st_mode))
     if not os.access(target, os.W_OK):
         raise PermissionError("no permission to write it")
     return target, stat.S_IMODE(found.st_mode)
+
+
+def _describe_special_file(mode: int) -> str:
+    if stat.S_ISDIR(mode):
+        return "a folder"
+    if stat.S_ISFIFO(mode):
+        return "a pipe"
+    if stat.S_ISSOCK(mode):
+        return "a socket"
+    return "a device"
 
 
 def _make_temporary_path(folder: Path) -> Path:

@@ -58,7 +58,8 @@ def parse_xml(text: str | bytes, file: Path) -> ElementTree.Element:
     Bytes are in the encoding that the document states.
     """
     builder = ElementTree.TreeBuilder(element_factory=_Element)
-    parser, depth = expat.ParserCreate(), 0
+    parser = expat.ParserCreate()
+    depth = 0
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         nonlocal depth
@@ -79,7 +80,7 @@ def parse_xml(text: str | bytes, file: Path) -> ElementTree.Element:
         depth -= 1
         builder.end(tag)
 
-    def entity(name: str, *_: object) -> None:
+    def refuse_entity(name: str, *_: object) -> None:
         raise InputError(
             "entities are not supported",
             file=file,
@@ -88,8 +89,10 @@ def parse_xml(text: str | bytes, file: Path) -> ElementTree.Element:
             expected="plain text",
         )
 
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.CharacterDataHandler, parser.EntityDeclHandler = builder.data, entity
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
+    parser.CharacterDataHandler = builder.data
+    parser.EntityDeclHandler = refuse_entity
     parser.buffer_text = True
     try:
         parser.Parse(text.encode() if isinstance(text, str) else text, True)

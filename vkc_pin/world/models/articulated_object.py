@@ -214,9 +214,8 @@ class ArticulatedObject:
     resistance: Mapping[str, Resistance] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        return (
-            f"<ArticulatedObject {self.name}: joints {', '.join(self.coordinates.names) or 'none'}>"
-        )
+        joints = ", ".join(self.coordinates.names) or "none"
+        return f"<ArticulatedObject {self.name}: joints {joints}>"
 
     @property
     def mass(self) -> float:
@@ -226,17 +225,21 @@ class ArticulatedObject:
     @cached_property
     def links(self) -> tuple[str, ...]:
         """Names of the links."""
-        return tuple(
-            str(frame.name) for frame in self.model.frames if frame.type == pin.FrameType.BODY
-        )
+        return tuple(str(frame.name) for frame in self._link_frames())
+
+    def _link_frames(self) -> list[pin.Frame]:
+        return [frame for frame in self.model.frames if frame.type == pin.FrameType.BODY]
 
     def links_moved_by(self, joints: Set[str]) -> set[str]:
         """Return the names of the links that are moved by any of `joints`."""
-        above = [{str(self.model.names[k]) for k in support} for support in self.model.supports]
-        bodies = [frame for frame in self.model.frames if frame.type == pin.FrameType.BODY]
-        return {
-            str(frame.name) for frame in bodies if not joints.isdisjoint(above[frame.parentJoint])
-        }
+        moved = set[str]()
+        for frame in self._link_frames():
+            # Joints from the base to the link, including the link's own.
+            support = self.model.supports[frame.parentJoint]
+            names = [str(self.model.names[joint]) for joint in support]
+            if not joints.isdisjoint(names):
+                moved.add(str(frame.name))
+        return moved
 
     def attachment(self, name: str | None = None) -> Attachment:
         """Return the attachment `name`, or the default one.
@@ -252,7 +255,8 @@ class ArticulatedObject:
                     field="attachment",
                 )
             return next(iter(self.attachments.values()))
-        return self.attachments[check_choice(name, self.attachments, f"attachment of {self.name}")]
+        chosen = check_choice(name, self.attachments, f"attachment of {self.name}")
+        return self.attachments[chosen]
 
     def link_frame(self, link: str) -> int:
         """Return the index of the frame of `link` in `model`.
@@ -260,11 +264,8 @@ class ArticulatedObject:
         Raises:
             UnknownNameError: There is no link of that name.
         """
-        return int(
-            self.model.getFrameId(
-                check_choice(link, self.links, f"link of {self.name}"), pin.FrameType.BODY
-            )
-        )
+        name = check_choice(link, self.links, f"link of {self.name}")
+        return int(self.model.getFrameId(name, pin.FrameType.BODY))
 
     def link_placement(self, link: str, state: ArrayLike) -> pin.SE3:
         """Return the placement of `link` in the base link's frame.

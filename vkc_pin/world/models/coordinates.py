@@ -72,17 +72,18 @@ class Coordinates:
         plain: list[tuple[int, int]] = []  # q[i] = z[j]
         angles: list[tuple[int, int]] = []  # q[i] = cos z[j], q[i + 1] = sin z[j]
         quaternions: list[tuple[int, int]] = []  # q[i:i + 4] = z[j:j + 4], normalized
-        lower, upper = [], []
+        lower: list[float] = []
+        upper: list[float] = []
         followers = [int(index) for index in model.mimicking_joints]
         for index in range(1, model.njoints):
             joint = model.joints[index]
-            name = model.names[index]
-            i = joint.idx_q
-            j = len(names)
             if joint.nv == 0 and index in followers:
                 continue
-            parts, limited, direct = _list_coordinates(joint, name)
+            name = model.names[index]
             kind = joint.shortname()
+            parts, limited, direct = _list_coordinates(joint, name)
+            i = joint.idx_q
+            j = len(names)
             if kind == "JointModelPlanar":
                 angles.append((i + 2, j + 2))
             elif kind == "JointModelFreeFlyer":
@@ -92,15 +93,12 @@ class Coordinates:
             plain += [(i + k, j + k) for k in range(direct)]
             names += [name + part for part in parts]
             units += parts.values()
-            lower += [
-                *model.lowerPositionLimit[i : i + limited],
-                *[-np.inf] * (len(parts) - limited),
-            ]
-            upper += [
-                *model.upperPositionLimit[i : i + limited],
-                *[np.inf] * (len(parts) - limited),
-            ]
             joints += [index] * len(parts)
+            unlimited = len(parts) - limited
+            lower += [*model.lowerPositionLimit[i : i + limited]]
+            lower += [-np.inf] * unlimited
+            upper += [*model.upperPositionLimit[i : i + limited]]
+            upper += [np.inf] * unlimited
         self.names: tuple[str, ...] = tuple(names)
         self.units: tuple[str, ...] = tuple(units)
         self.joints: tuple[int, ...] = tuple(joints)
@@ -109,10 +107,12 @@ class Coordinates:
         self.upper: Floats = np.array(upper, float)
         self.velocity: Floats = np.array(model.velocityLimit, float)
         self.nq = int(model.nq)
-        self.moves: tuple[MovedJoint, ...] = self._moves(model, followers)
-        self.lengths, self.turns = np.zeros(self.size), np.zeros(self.size)
+        self.moves: tuple[MovedJoint, ...] = self._find_moves(model, followers)
+        self.lengths = np.zeros(self.size)
+        self.turns = np.zeros(self.size)
         for move in self.moves:
-            (self.lengths if move.slides else self.turns)[move.coordinate] += abs(move.factor)
+            totals = self.lengths if move.slides else self.turns
+            totals[move.coordinate] += abs(move.factor)
         self._joint_count = int(model.njoints)
         self._plain = plain
         self._angles = angles
@@ -124,30 +124,28 @@ class Coordinates:
         """Entries of `moves` for mimic joints."""
         return tuple(move for move in self.moves if move.joint != self.joints[move.coordinate])
 
-    def _moves(self, model: pin.Model, followers: list[int]) -> tuple[MovedJoint, ...]:
-        """Return the joints driven by each coordinate."""
-        moves = [
-            MovedJoint(k, joint, 1.0, 0.0, self.units[k] == "m")
-            for k, joint in enumerate(self.joints)
-        ]
+    def _find_moves(self, model: pin.Model, followers: list[int]) -> tuple[MovedJoint, ...]:
+        """Return the joints driven by each coordinate, sorted by coordinate."""
+        moves = list[MovedJoint]()
+        coordinate_of = dict[int, int]()  # index in q → coordinate
+        for coordinate, joint in enumerate(self.joints):
+            slides = self.units[coordinate] == "m"
+            moves.append(MovedJoint(coordinate, joint, 1.0, 0.0, slides))
+            coordinate_of[model.joints[joint].idx_q] = coordinate
         if followers:
             data = model.createData()
             pin.forwardKinematics(model, data, pin.neutral(model))
-            coordinate_of = {model.joints[joint].idx_q: k for k, joint in enumerate(self.joints)}
-            # Pinocchio 4.1 may order `mimicked_joints` and `mimicking_joints` differently.
-            for joint in followers:
-                mimic_joint = model.joints[joint].extract()
-                axis = np.asarray(data.joints[joint].S, float).ravel()
-                factor, offset = float(mimic_joint.scaling), float(mimic_joint.offset)
-                moves.append(
-                    MovedJoint(
-                        coordinate_of[model.joints[joint].idx_q],
-                        joint,
-                        factor,
-                        offset,
-                        not axis[3:].any(),
-                    )
-                )
+        # A mimic joint has the index in q of its leader, which is asked here because Pinocchio 4.1
+        # may order `mimicked_joints` and `mimicking_joints` differently.
+        for joint in followers:
+            coordinate = coordinate_of[model.joints[joint].idx_q]
+            mimic_joint = model.joints[joint].extract()
+            factor = float(mimic_joint.scaling)
+            offset = float(mimic_joint.offset)
+            # The motion subspace S has the linear velocity, then the angular one.
+            subspace = np.asarray(data.joints[joint].S, float).ravel()
+            slides = not subspace[3:].any()
+            moves.append(MovedJoint(coordinate, joint, factor, offset, slides))
         return tuple(sorted(moves))
 
     def find_moved_joints(self, changed: ArrayLike) -> Bools:
@@ -156,8 +154,10 @@ class Coordinates:
         Args:
             changed: Whether each coordinate changes, shape (n,).
         """
-        changed, found = np.asarray(changed, bool), np.zeros(self._joint_count, bool)
-        found[[move.joint for move in self.moves if changed[move.coordinate]]] = True
+        changed = np.asarray(changed, bool)
+        found = np.zeros(self._joint_count, bool)
+        moved = [move.joint for move in self.moves if changed[move.coordinate]]
+        found[moved] = True
         return found
 
     def compute_max_steps(self, length: float, angle: float) -> Floats:
@@ -191,11 +191,12 @@ class Coordinates:
             q[..., q_slice] = z[..., z_slice]
         for i, j in self._angles:
             angle = z[..., j].copy()  # contiguous, since NumPy may round differently otherwise
-            q[..., i], q[..., i + 1] = np.cos(angle), np.sin(angle)
+            q[..., i] = np.cos(angle)
+            q[..., i + 1] = np.sin(angle)
         for i, j in self._quaternions:
-            q[..., i : i + 4] = z[..., j : j + 4] / np.linalg.norm(
-                z[..., j : j + 4], axis=-1, keepdims=True
-            )
+            quaternion = z[..., j : j + 4]
+            norm = np.linalg.norm(quaternion, axis=-1, keepdims=True)
+            q[..., i : i + 4] = quaternion / norm
         return q
 
     def z(self, q: ArrayLike) -> Floats:
@@ -212,7 +213,9 @@ class Coordinates:
         for q_slice, z_slice in self._runs:
             z[..., z_slice] = q[..., q_slice]
         for i, j in self._angles:
-            z[..., j] = np.arctan2(q[..., i + 1].copy(), q[..., i].copy())
+            cosine = q[..., i].copy()
+            sine = q[..., i + 1].copy()
+            z[..., j] = np.arctan2(sine, cosine)
         for i, j in self._quaternions:
             z[..., j : j + 4] = q[..., i : i + 4]
         return z
@@ -228,7 +231,8 @@ class Coordinates:
         for i, j in self._plain:
             entries[i] = z[j]
         for i, j in self._angles:
-            entries[i], entries[i + 1] = casadi.cos(z[j]), casadi.sin(z[j])
+            entries[i] = casadi.cos(z[j])
+            entries[i + 1] = casadi.sin(z[j])
         return casadi.vertcat(*entries)
 
     def index(self, name: str) -> int:
@@ -250,13 +254,13 @@ def _list_coordinates(joint: pin.JointModel, name: str) -> tuple[dict[str, str],
     if kind == "JointModelPlanar":
         return {"_x": "m", "_y": "m", "_yaw": "rad"}, 2, 2
     if kind == "JointModelFreeFlyer":
-        positions = {"_x": "m", "_y": "m", "_z": "m"}
-        quaternion = {"_qx": "1", "_qy": "1", "_qz": "1", "_qw": "1"}
-        return {**positions, **quaternion}, 0, 3
+        units = {"_x": "m", "_y": "m", "_z": "m", "_qx": "1", "_qy": "1", "_qz": "1", "_qw": "1"}
+        return units, 0, 3
     if kind in _UNBOUNDED:
         return {"": "rad"}, 0, 0
     if joint.nq == 1 and joint.nv == 1:
-        return {"": "m" if kind in _SLIDING else "rad"}, 1, 1
+        unit = "m" if kind in _SLIDING else "rad"
+        return {"": unit}, 1, 1
     expected = "a planar joint or one of 1 degree of freedom"
     raise InputError("this joint type is not supported", field=name, expected=expected, got=kind)
 
@@ -270,8 +274,13 @@ def _merge_into_slices(pairs: list[tuple[int, int]]) -> list[tuple[slice, slice]
     """Merge consecutive index pairs into pairs of slices, which index arrays much faster."""
     found: list[tuple[slice, slice]] = []
     for i, j in pairs:
-        if found and (found[-1][0].stop, found[-1][1].stop) == (i, j):
-            found[-1] = slice(found[-1][0].start, i + 1), slice(found[-1][1].start, j + 1)
-        else:
-            found.append((slice(i, i + 1), slice(j, j + 1)))
+        first_i = i
+        first_j = j
+        if found:
+            before_i, before_j = found[-1]
+            if before_i.stop == i and before_j.stop == j:
+                found.pop()
+                first_i = before_i.start
+                first_j = before_j.start
+        found.append((slice(first_i, i + 1), slice(first_j, j + 1)))
     return found

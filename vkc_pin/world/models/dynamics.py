@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -86,31 +87,44 @@ def read_resistances(
         names: Names of the movable joints.
     """
     _, root = read_xml(urdf, "URDF", text)
-    resistance = dict[str, Resistance]()
+    resistances = dict[str, Resistance]()
     for joint in root.findall("joint"):
-        name, stated = joint.get("name", ""), dict[str, float]()
+        name = joint.get("name", "")
         if name not in names:
             continue
-        for dynamics in joint.findall("dynamics"):
-            for key in ("friction", "damping"):
-                (stated[key],) = parse_numbers(urdf, dynamics, key, 1, default="0", where=name)
-                if stated[key] < 0.0:
-                    problem, got = "friction and damping must not be negative", stated[key]
-                    field, expected = f"{name}: dynamics {key}", "0 or more"
-                    raise make_element_error(
-                        urdf, dynamics, problem, field=field, expected=expected, got=got
-                    )
-        given = joints.get(name, ObjectJointSchema())
-        if given.springref is not None and given.stiffness is None:
-            problem, expected = "springref without stiffness", "stiffness as well"
+        values = _read_urdf_resistance(urdf, joint)
+        described = joints.get(name, ObjectJointSchema())
+        if described.springref is not None and described.stiffness is None:
             raise document.make_error(
-                ("joints", name, "springref"), problem, expected=expected, got=given.springref
+                ("joints", name, "springref"),
+                "springref without stiffness",
+                expected="stiffness as well",
+                got=described.springref,
             )
-        described = given.model_dump(
-            include={"friction", "damping", "stiffness", "springref"}, exclude_none=True
-        )
-        resistance[name] = Resistance(**{**stated, **described})
-    return resistance
+        keys = {"friction", "damping", "stiffness", "springref"}
+        values.update(described.model_dump(include=keys, exclude_none=True))
+        resistances[name] = Resistance(**values)
+    return resistances
+
+
+def _read_urdf_resistance(urdf: Path, joint: ElementTree.Element) -> dict[str, float]:
+    """Return the friction and damping that a URDF states for a joint."""
+    name = joint.get("name", "")
+    values = dict[str, float]()
+    for dynamics in joint.findall("dynamics"):
+        for key in ("friction", "damping"):
+            (value,) = parse_numbers(urdf, dynamics, key, 1, default="0", where=name)
+            if value < 0.0:
+                raise make_element_error(
+                    urdf,
+                    dynamics,
+                    "friction and damping must not be negative",
+                    field=f"{name}: dynamics {key}",
+                    expected="0 or more",
+                    got=value,
+                )
+            values[key] = value
+    return values
 
 
 def compute_mass(model: pin.Model) -> float:
@@ -136,18 +150,18 @@ def set_mass(model: pin.Model, collision: pin.GeometryModel, mass: float) -> Non
             model.inertias[0] = pin.Inertia(1.0, np.zeros(3), np.zeros((3, 3)))
     factor = mass / compute_mass(model)
     for joint, inertia in enumerate(model.inertias):
-        model.inertias[joint] = pin.Inertia(
-            factor * inertia.mass, inertia.lever, factor * np.asarray(inertia.inertia)
-        )
+        scaled = factor * np.asarray(inertia.inertia)
+        model.inertias[joint] = pin.Inertia(factor * inertia.mass, inertia.lever, scaled)
 
 
 def compute_solid_inertia(shape: pin.GeometryObject, density: float = 1.0) -> pin.Inertia:
     """Return the inertia of a convex shape of uniform `density` [kg/m³], in its own frame."""
-    solid = compute_hull(triangulate(shape.geometry)[0])
+    vertices, _ = triangulate(shape.geometry)
+    solid = compute_hull(vertices)
     solid.density = density
-    return pin.Inertia(
-        float(solid.mass), np.asarray(solid.center_mass), np.asarray(solid.moment_inertia)
-    )
+    center = np.asarray(solid.center_mass)
+    rotational_inertia = np.asarray(solid.moment_inertia)
+    return pin.Inertia(float(solid.mass), center, rotational_inertia)
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,20 +200,19 @@ def compute_torque_limits(
     """
     limits = np.asarray(model.effortLimit, float)[: coordinates.size].copy()
     limits[:3] = np.inf
-    if not sum(inertia.mass for inertia in list(model.inertias)[2:]) > 0.0:
-        return TorqueLimits(np.full_like(limits, np.inf), ("the URDF states no masses of the arm",))
-    stated = (limits > 0.0) & (limits < UNLIMITED)
-    limits[~stated] = np.inf
-    names, notes = np.array(coordinates.names), list[str]()
-    if len(unstated := names[3:][~stated[3:]]):
+    arm_mass = sum(inertia.mass for inertia in list(model.inertias)[2:])
+    if not arm_mass > 0.0:
+        unlimited = np.full_like(limits, np.inf)
+        return TorqueLimits(unlimited, ("the URDF states no masses of the arm",))
+    is_stated = (limits > 0.0) & (limits < UNLIMITED)
+    limits[~is_stated] = np.inf
+    names = np.array(coordinates.names)
+    notes = list[str]()
+    unstated = names[3:][~is_stated[3:]]
+    if len(unstated):
         notes.append(f"the URDF states no effort of {', '.join(unstated)}")
-    rng, data, gravity = np.random.default_rng(0), model.createData(), np.zeros_like(limits)
-    low, high = np.maximum(lower, -np.pi), np.minimum(upper, np.pi)
-    for z in rng.uniform(low, np.maximum(low, high), (_SAMPLES, len(low))):
-        gravity = np.maximum(
-            gravity, np.abs(pin.computeGeneralizedGravity(model, data, coordinates.q(z)))
-        )
-    for k in np.flatnonzero((gravity > limits) & stated):
+    gravity = _sample_gravity_torques(model, coordinates, lower, upper)
+    for k in np.flatnonzero((gravity > limits) & is_stated):
         unit = {"m": "N", "rad": "N·m"}[coordinates.units[k]]
         notes.append(
             f"{names[k]}: the effort limit of {limits[k]:g} {unit} cannot hold the arm, "
@@ -207,3 +220,18 @@ def compute_torque_limits(
         )
         limits[k] = np.inf
     return TorqueLimits(limits, tuple(notes))
+
+
+def _sample_gravity_torques(
+    model: pin.Model, coordinates: Coordinates, lower: Floats, upper: Floats
+) -> Floats:
+    """Return the largest gravity torques in random configurations, shape (n,) [N·m], [N]."""
+    rng = np.random.default_rng(0)
+    low = np.maximum(lower, -np.pi)
+    high = np.maximum(low, np.minimum(upper, np.pi))
+    data = model.createData()
+    largest = np.zeros(coordinates.size)
+    for z in rng.uniform(low, high, (_SAMPLES, len(low))):
+        gravity = pin.computeGeneralizedGravity(model, data, coordinates.q(z))
+        largest = np.maximum(largest, np.abs(gravity))
+    return largest

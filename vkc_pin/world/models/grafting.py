@@ -18,11 +18,11 @@ def round_placement(placement: pin.SE3, tolerance: float = 1e-12) -> pin.SE3:
 
     Exact entries keep symbolic kinematics sparse.
     """
-    rotation, translation = np.array(placement.rotation), np.array(placement.translation)
-    for array in (rotation, translation):
-        array[np.abs(array) < tolerance] = 0.0
-    for sign in (-1.0, 1.0):
-        rotation[np.abs(rotation - sign) < tolerance] = sign
+    rotation = np.array(placement.rotation)
+    translation = np.array(placement.translation)
+    translation[np.abs(translation) < tolerance] = 0.0
+    for exact in (0.0, -1.0, 1.0):
+        rotation[np.abs(rotation - exact) < tolerance] = exact
     return pin.SE3(rotation, translation)
 
 
@@ -49,15 +49,20 @@ def add_joint(
         Index of the joint in `model`.
     """
     source, index = like
-    copy = source.joints[index]
-    q, v = slice(copy.idx_q, copy.idx_q + copy.nq), slice(copy.idx_v, copy.idx_v + copy.nv)
-    limits = (
+    original = source.joints[index]
+    q = slice(original.idx_q, original.idx_q + original.nq)
+    v = slice(original.idx_v, original.idx_v + original.nv)
+    added = model.addJoint(
+        parent,
+        joint,
+        placement,
+        prefix + source.names[index],
         source.effortLimit[v],
         source.velocityLimit[v],
         source.lowerPositionLimit[q],
         source.upperPositionLimit[q],
     )
-    return int(model.addJoint(parent, joint, placement, prefix + source.names[index], *limits))
+    return int(added)
 
 
 def graft(
@@ -79,29 +84,32 @@ def graft(
     if tree.inertias[0].mass > 0.0:  # of links fixed to the root
         model.appendBodyToJoint(parent, tree.inertias[0], placement)
     for index in range(1, tree.njoints):
-        joint, above = tree.joints[index], tree.parents[index]
-        local = tree.jointPlacements[index] if above else placement * tree.jointPlacements[index]
+        local = tree.jointPlacements[index]
+        tree_parent = tree.parents[index]
+        if tree_parent == 0:
+            local = placement * local
         added = add_joint(
-            model, joints[above], joint, round_placement(local), like=(tree, index), prefix=prefix
+            model,
+            joints[tree_parent],
+            tree.joints[index],
+            round_placement(local),
+            like=(tree, index),
+            prefix=prefix,
         )
         model.appendBodyToJoint(added, tree.inertias[index], pin.SE3.Identity())
         joints.append(added)
-    bodies = {frame.name for frame in tree.frames if frame.type == pin.FrameType.BODY}
+    links = {frame.name for frame in tree.frames if frame.type == pin.FrameType.BODY}
     for frame in tree.frames[1:]:
-        if frame.type != pin.FrameType.BODY and frame.name in bodies:
-            # a joint and a link of a URDF may share a name, but Pinocchio cannot look up frames
-            # whose names are not unique
+        # A joint and a link of a URDF may share a name, but Pinocchio cannot look up frames whose
+        # names are not unique.
+        if frame.type != pin.FrameType.BODY and frame.name in links:
             continue
-        local = frame.placement if frame.parentJoint else placement * frame.placement
-        model.addFrame(
-            pin.Frame(
-                prefix + frame.name,
-                joints[frame.parentJoint],
-                0,
-                round_placement(local),
-                frame.type,
-            )
-        )
+        local = frame.placement
+        if frame.parentJoint == 0:
+            local = placement * local
+        joint = joints[frame.parentJoint]
+        name = prefix + frame.name
+        model.addFrame(pin.Frame(name, joint, 0, round_placement(local), frame.type))
     return joints
 
 
@@ -127,7 +135,9 @@ def graft_geometry(
     """
     added = []
     for original in objects:
-        local = original.placement if original.parentJoint else placement * original.placement
+        local = original.placement
+        if original.parentJoint == 0:
+            local = placement * local
         copy = pin.GeometryObject(original)
         copy.name = prefix + original.name
         copy.parentJoint = joints[original.parentJoint]

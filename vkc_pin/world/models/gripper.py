@@ -20,7 +20,7 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.documents import Document
 from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.models.coordinates import Coordinates
-from vkc_pin.world.models.couplings import find_followers
+from vkc_pin.world.models.couplings import JointCoupling, find_followers
 from vkc_pin.world.models.robot_model import build_unlocked_model, find_joint_limits
 from vkc_pin.world.models.robot_schema import FingerSchema
 from vkc_pin.world.models.shapes import LIMIT_SLACK
@@ -31,6 +31,7 @@ WIDTH_TOLERANCE = 1e-4
 """Accuracy of the width of the widest bar [m]."""
 _MAX_WIDTH = 0.5  # [m]: larger than any opening
 _ROD_LENGTH = 0.12  # [m]: longer than fingers are wide
+# Rotation that turns the z axis, the axis of coal's cylinders, into the y axis.
 _ALONG_Y = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 WIDEST_BAR = _MAX_WIDTH - WIDTH_TOLERANCE
 """Width from which no shape limits a bar [m]."""
@@ -53,7 +54,7 @@ def check_bar_fits(width: float, shapes: Sequence[PlacedShape]) -> bool:
 
 def find_widest_bar(shapes: Sequence[PlacedShape]) -> float:
     """Return the width of the widest bar that fits at the tool's origin [m]; 0 if none does."""
-    return _find_largest(lambda width: check_bar_fits(width, shapes))
+    return _find_largest_width(lambda width: check_bar_fits(width, shapes))
 
 
 def find_thickest_rod(shapes: Sequence[PlacedShape]) -> float:
@@ -61,27 +62,36 @@ def find_thickest_rod(shapes: Sequence[PlacedShape]) -> float:
 
     It is 0 if none fits.
     """
-    return _find_largest(
-        lambda width: _is_free(coal.Cylinder(width / 2.0, _ROD_LENGTH), _ALONG_Y, shapes)
-    )
+
+    def fits(diameter: float) -> bool:
+        return _is_free(coal.Cylinder(diameter / 2.0, _ROD_LENGTH), _ALONG_Y, shapes)
+
+    return _find_largest_width(fits)
 
 
 def _is_free(solid: coal.ShapeBase, rotation: Floats, shapes: Sequence[PlacedShape]) -> bool:
-    where = coal.Transform3s(rotation, np.zeros(3))
-    request, result = coal.CollisionRequest(), coal.CollisionResult()
+    """Return whether a solid at the tool's origin collides with none of the shapes."""
+    solid_placement = coal.Transform3s(rotation, np.zeros(3))
+    request = coal.CollisionRequest()
+    result = coal.CollisionResult()
     for geometry, placement in shapes:
         result.clear()
-        at = coal.Transform3s(placement.rotation, placement.translation)
-        if coal.collide(solid, where, geometry, at, request, result):
+        shape_placement = coal.Transform3s(placement.rotation, placement.translation)
+        if coal.collide(solid, solid_placement, geometry, shape_placement, request, result):
             return False
     return True
 
 
-def _find_largest(check: Callable[[float], bool]) -> float:
-    low, high = 0.0, _MAX_WIDTH
+def _find_largest_width(fits: Callable[[float], bool]) -> float:
+    """Return the largest width that fits [m], found by bisection; 0 if none does."""
+    low = 0.0
+    high = _MAX_WIDTH
     while high - low > WIDTH_TOLERANCE:
         middle = (low + high) / 2.0
-        low, high = (middle, high) if check(middle) else (low, middle)
+        if fits(middle):
+            low = middle
+        else:
+            high = middle
     return low
 
 
@@ -154,13 +164,16 @@ class Gripper:
 
         Placements are in the frame of the robot's joint that carries the finger.
         """
-        data, first = self._compute_data(self.compute_positions(opening)), self._first_finger_joint
+        data = self._compute_data(self.compute_positions(opening))
+        first_finger = self._first_finger_joint
         found = {}
         for frame in self.model.frames:
             joint = frame.parentJoint
-            if joint >= first:
-                carrier = max(j for j in self.model.supports[joint] if j < first)
-                found[str(frame.name)] = data.oMi[carrier].actInv(data.oMi[joint]) * frame.placement
+            if joint < first_finger:
+                continue
+            carrier = max(j for j in self.model.supports[joint] if j < first_finger)
+            joint_in_carrier = data.oMi[carrier].actInv(data.oMi[joint])
+            found[str(frame.name)] = joint_in_carrier * frame.placement
         return found
 
     def attach_shapes(
@@ -176,36 +189,40 @@ class Gripper:
 
     def _compute_data(self, fingers: Floats) -> pin.Data:
         """Return kinematics data with given finger positions, and all other joints at zero."""
-        data, coordinates = self.model.createData(), Coordinates(self.model)
-        z = np.append(np.zeros(coordinates.size - len(fingers)), fingers)
+        coordinates = Coordinates(self.model)
+        others = np.zeros(coordinates.size - len(fingers))
+        z = np.append(others, fingers)
+        data = self.model.createData()
         pin.framesForwardKinematics(self.model, data, coordinates.q(z))
         return data
 
     def _place_hand(self, fingers: Floats) -> list[PlacedShape]:
         """Return the shapes of fingers and palm in the tool frame, with given finger positions."""
-        data, frame = self._compute_data(fingers), self.model.getFrameId(self.tool_frame)
-        tool_inverse, palm = data.oMf[frame].inverse(), self.model.frames[frame].parentJoint
-        shapes = [
-            shape
-            for shape in self.collision.geometryObjects
-            if shape.parentJoint == palm or shape.parentJoint >= self._first_finger_joint
-        ]
-        return [
-            (shape.geometry, tool_inverse * data.oMi[shape.parentJoint] * shape.placement)
-            for shape in shapes
-        ]
+        data = self._compute_data(fingers)
+        frame = self.model.getFrameId(self.tool_frame)
+        world_in_tool = data.oMf[frame].inverse()
+        palm = self.model.frames[frame].parentJoint
+        placed = list[PlacedShape]()
+        for shape in self.collision.geometryObjects:
+            joint = shape.parentJoint
+            if joint == palm or joint >= self._first_finger_joint:
+                placement = world_in_tool * data.oMi[joint] * shape.placement
+                placed.append((shape.geometry, placement))
+        return placed
 
     def _find_open_fraction(self, opening: float) -> float:
         """Return the smallest fraction of the range from closed to open at which a bar fits."""
-        low, high = 0.0, 1.0
+        low = 0.0
+        high = 1.0
         if opening <= self.min_opening or check_bar_fits(opening, self._place_hand(self.closed)):
             return low
         for _ in range(_BISECTION_STEPS):
             middle = (low + high) / 2.0
-            fits = check_bar_fits(
-                opening, self._place_hand((1.0 - middle) * self.closed + middle * self.open)
-            )
-            low, high = (low, middle) if fits else (middle, high)
+            fingers = (1.0 - middle) * self.closed + middle * self.open
+            if check_bar_fits(opening, self._place_hand(fingers)):
+                high = middle
+            else:
+                low = middle
         return high
 
 
@@ -215,12 +232,15 @@ def _attach_shapes(
     """Return copies of the shapes on the joints of the model with unlocked fingers."""
     found = []
     for shape in shapes:
-        copy, old = pin.GeometryObject(shape), model.frames[shape.parentFrame]
-        copy.parentFrame = unlocked.getFrameId(old.name, pin.FrameType.BODY)
-        new = unlocked.frames[copy.parentFrame]
-        if new.parentJoint >= model.njoints:
-            copy.placement = new.placement * old.placement.actInv(shape.placement)
-        copy.parentJoint = new.parentJoint
+        link = model.frames[shape.parentFrame]
+        copy = pin.GeometryObject(shape)
+        copy.parentFrame = unlocked.getFrameId(link.name, pin.FrameType.BODY)
+        unlocked_link = unlocked.frames[copy.parentFrame]
+        # Joints of the fingers come last; links on all others have the same placement.
+        if unlocked_link.parentJoint >= model.njoints:
+            shape_in_link = link.placement.actInv(shape.placement)
+            copy.placement = unlocked_link.placement * shape_in_link
+        copy.parentJoint = unlocked_link.parentJoint
         found.append(copy)
     return found
 
@@ -252,61 +272,27 @@ def build_gripper(
     """
     if not stated:
         return None
-    follows = find_followers(file.root)
-    palm = list(full.supports[full.frames[full.getFrameId(tool_frame)].parentJoint])
-    arm = max(j for j in palm if full.names[j] in list(model.names))
-    for joint, finger in stated.items():
-        where = ("gripper", joint)
-        if joint in follows:
-            problem, leader = "this joint follows another one", follows[joint].leader
-            raise document.make_error(
-                where, problem, expected=f"'{leader}', which it follows", got=joint
-            )
-        joint_index = full.getJointId(joint)
-        if joint_index in palm or arm not in list(full.supports[joint_index]):
-            expected = f"a joint of the hand, a descendant of '{full.names[arm]}'"
-            raise document.make_error(
-                where, "this is not a finger joint", expected=expected, got=joint
-            )
-        low, high = find_joint_limits(full, joint)
-        for key, value in (("closed", finger.closed), ("open", finger.open)):
-            if not low - LIMIT_SLACK <= value <= high + LIMIT_SLACK:
-                problem = "this finger position is outside the joint's limits"
-                raise document.make_error(
-                    (*where, key), problem, expected=f"between {low:g} and {high:g}", got=value
-                )
-        if finger.closed == finger.open:
-            raise document.make_error(
-                where,
-                "this finger joint does not move",
-                expected="different positions for closed and open",
-                got=finger.open,
-            )
-    finger_joints = [
-        name
-        for name in rest
-        if name in stated or (name in follows and follows[name].leader in stated)
-    ]
+    couplings = find_followers(file.root)
+    _check_fingers(full, model, tool_frame, stated, couplings, document)
+    finger_joints = list[str]()
+    for name in rest:
+        follows_finger = name in couplings and couplings[name].leader in stated
+        if name in stated or follows_finger:
+            finger_joints.append(name)
     names = tuple(sorted(finger_joints, key=full.getJointId))
     unlocked = build_unlocked_model(full, file, model, names, rest, height)
     shapes = pin.GeometryModel()
     for shape in _attach_shapes(list(collision.geometryObjects), model, unlocked):
         shapes.addGeometryObject(shape)
-
-    def collect_positions(state: str) -> Floats:
-        positions = {joint: float(getattr(finger, state)) for joint, finger in stated.items()}
-        positions |= {
-            name: coupling.factor * positions[coupling.leader] + coupling.offset
-            for name, coupling in follows.items()
-            if coupling.leader in positions
-        }
-        return np.array([positions[name] for name in names])
-
+    closed = {joint: float(finger.closed) for joint, finger in stated.items()}
+    opened = {joint: float(finger.open) for joint, finger in stated.items()}
+    _add_followers(closed, couplings)
+    _add_followers(opened, couplings)
     gripper = Gripper(
         model=unlocked,
         names=names,
-        closed=collect_positions("closed"),
-        open=collect_positions("open"),
+        closed=np.array([closed[name] for name in names]),
+        open=np.array([opened[name] for name in names]),
         rest=np.array([rest[name] for name in names]),
         tool_frame=tool_frame,
         collision=shapes,
@@ -320,3 +306,57 @@ def build_gripper(
             ("gripper",), "the gripper does not open", expected=expected, got=got
         )
     return gripper
+
+
+def _add_followers(positions: dict[str, float], couplings: Mapping[str, JointCoupling]) -> None:
+    """Add the positions of joints that follow those with a position.
+
+    No follower has followers of its own: couplings lead to the end of their chain.
+    """
+    for name, coupling in couplings.items():
+        if coupling.leader in positions:
+            positions[name] = coupling.factor * positions[coupling.leader] + coupling.offset
+
+
+def _check_fingers(
+    full: pin.Model,
+    model: pin.Model,
+    tool_frame: str,
+    stated: Mapping[str, FingerSchema],
+    couplings: Mapping[str, JointCoupling],
+    document: Document,
+) -> None:
+    """Check that the joints of a `gripper` in a robot.yaml are joints of the hand that move."""
+    tool = full.frames[full.getFrameId(tool_frame)]
+    palm_support = list(full.supports[tool.parentJoint])
+    planned = list(model.names)
+    last_arm_joint = max(joint for joint in palm_support if full.names[joint] in planned)
+    for joint, finger in stated.items():
+        field = ("gripper", joint)
+        if joint in couplings:
+            raise document.make_error(
+                field,
+                "this joint follows another one",
+                expected=f"'{couplings[joint].leader}', which it follows",
+                got=joint,
+            )
+        index = full.getJointId(joint)
+        is_on_hand = last_arm_joint in list(full.supports[index])
+        if index in palm_support or not is_on_hand:
+            expected = f"a joint of the hand, a descendant of '{full.names[last_arm_joint]}'"
+            raise document.make_error(
+                field, "this is not a finger joint", expected=expected, got=joint
+            )
+        low, high = find_joint_limits(full, joint)
+        for key, value in (("closed", finger.closed), ("open", finger.open)):
+            if not low - LIMIT_SLACK <= value <= high + LIMIT_SLACK:
+                problem = "this finger position is outside the joint's limits"
+                expected = f"between {low:g} and {high:g}"
+                raise document.make_error((*field, key), problem, expected=expected, got=value)
+        if finger.closed == finger.open:
+            raise document.make_error(
+                field,
+                "this finger joint does not move",
+                expected="different positions for closed and open",
+                got=finger.open,
+            )

@@ -12,6 +12,7 @@ from pydantic import Field, model_validator
 
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import check_mapping
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.pickling import freeze
 from vkc_pin.world.files.documents import Document, parse_document, read_yaml
 from vkc_pin.world.files.fields import (
@@ -50,6 +51,7 @@ _is_nonzero = require(
     "a direction cannot be zero",
     "a nonzero vector",
 )
+_MAX_COSINE = 1e-9  # of the angle between the directions of approach and closing
 Limits = Annotated[tuple[Number, Number], require_length(2), _contains_zero]
 Direction = Annotated[Vector3, _is_nonzero]
 
@@ -64,7 +66,7 @@ class FreedomSchema(Schema):
     limits: Limits
 
     @model_validator(mode="after")
-    def _consistent(self) -> FreedomSchema:
+    def _check_consistency(self) -> FreedomSchema:
         if (self.slide is None) == (self.turn is None):
             raise make_validation_error("a freedom needs one axis", "either slide or turn")
         if self.slide is not None and self.through is not None:
@@ -96,67 +98,62 @@ class AttachmentSchema(Schema):
     contact: Literal["grasp", "push", "touch"] = "grasp"
 
     @model_validator(mode="after")
-    def _consistent(self) -> AttachmentSchema:
-        given = sum(
-            orientation is not None for orientation in (self.rpy, self.quaternion, self.approach)
-        )
-        is_ambiguous = (self.approach is None) != (self.closing is None) or given > 1
-        is_oblique = (
-            self.approach is not None
-            and self.closing is not None
-            and abs(np.dot(self.approach, self.closing)) > 1e-9
-        )
-        has_axis = self.joint in ("revolute", "prismatic", "cylindrical")
-        axis = "joint revolute, prismatic or cylindrical"
-        is_cylindrical = self.joint == "cylindrical"
-        names = [freedom.name for freedom in self.freedoms]
-        for is_invalid, problem, expected in (
-            (
-                is_ambiguous,
+    def _check_consistency(self) -> AttachmentSchema:
+        self._check_orientation()
+        self._check_joint()
+        self._check_freedoms()
+        return self
+
+    def _check_orientation(self) -> None:
+        orientations = (self.rpy, self.quaternion, self.approach)
+        stated = [orientation for orientation in orientations if orientation is not None]
+        is_incomplete = (self.approach is None) != (self.closing is None)
+        if is_incomplete or len(stated) > 1:
+            raise make_validation_error(
                 "the tool's orientation is ambiguous",
                 "one of rpy, quaternion, or approach and closing",
-            ),
-            (
-                is_oblique,
-                "approach and closing are not perpendicular",
-                "two perpendicular directions",
-            ),
-            (
-                has_axis != (self.axis is not None),
+            )
+        if self.approach is not None and self.closing is not None:
+            cosine = np.dot(self.approach, self.closing)
+            if abs(cosine) > _MAX_COSINE:
+                raise make_validation_error(
+                    "approach and closing are not perpendicular", "two perpendicular directions"
+                )
+
+    def _check_joint(self) -> None:
+        has_axis = self.joint in ("revolute", "prismatic", "cylindrical")
+        if has_axis != (self.axis is not None):
+            raise make_validation_error(
                 "axis and joint do not match",
-                f"an axis with {axis}, and only there",
-            ),
-            (
-                has_axis and self.limits is None,
-                "limits missing",
-                "limits [lower, upper] of the grasp's joint",
-            ),
-            (
-                self.joint == "fixed" and self.limits is not None,
-                "a fixed grasp has no limits",
-                "no limits, or another joint",
-            ),
-            (
-                is_cylindrical != (self.turn is not None),
+                "an axis with joint revolute, prismatic or cylindrical, and only there",
+            )
+        if has_axis and self.limits is None:
+            raise make_validation_error(
+                "limits missing", "limits [lower, upper] of the grasp's joint"
+            )
+        if self.joint == "fixed" and self.limits is not None:
+            raise make_validation_error(
+                "a fixed grasp has no limits", "no limits, or another joint"
+            )
+        is_cylindrical = self.joint == "cylindrical"
+        if is_cylindrical != (self.turn is not None):
+            raise make_validation_error(
                 "turn and joint do not match",
                 "turn [lower, upper] with joint cylindrical, and only there",
-            ),
-            (
-                names and self.joint != "fixed",
-                "`freedoms` and `joint` exclude each other",
-                "one of them",
-            ),
-            (
-                self.contact == "push" and self.firm,
-                "a hand that pushes does not clamp",
-                "firm: false, or contact: grasp",
-            ),
-            (len(names) > 6, "too many freedoms", "at most 6"),
-            (len(set(names)) < len(names), "two freedoms share a name", "different names"),
-        ):
-            if is_invalid:
-                raise make_validation_error(problem, expected)
-        return self
+            )
+
+    def _check_freedoms(self) -> None:
+        names = [freedom.name for freedom in self.freedoms]
+        if names and self.joint != "fixed":
+            raise make_validation_error("`freedoms` and `joint` exclude each other", "one of them")
+        if self.contact == "push" and self.firm:
+            raise make_validation_error(
+                "a hand that pushes does not clamp", "firm: false, or contact: grasp"
+            )
+        if len(names) > 6:
+            raise make_validation_error("too many freedoms", "at most 6")
+        if len(set(names)) < len(names):
+            raise make_validation_error("two freedoms share a name", "different names")
 
 
 class LatchSchema(Schema):
@@ -197,9 +194,8 @@ def load_object(
         InputError: The description or its URDF is invalid.
     """
     if isinstance(name_or_path, Mapping):
-        return build_object(
-            Document(check_mapping(name_or_path, "description")), check_path(folder, "folder")
-        )
+        document = Document(check_mapping(name_or_path, "description"))
+        return build_object(document, check_path(folder, "folder"))
     file = find_file(name_or_path, "scenes", "objects/*.yaml", noun="object")
     return build_object(read_yaml(file), file.parent, file.stem)
 
@@ -213,64 +209,34 @@ def build_object(document: Document, folder: Path, name: str | None = None) -> A
         name: Name of the object. Default: the robot name in the URDF.
     """
     schema = parse_document(document, ObjectSchema)
-    text = schema.urdf if schema.urdf.lstrip().startswith("<") else None
-    urdf = (
-        folder / schema.urdf
-        if text is None
-        else Path(f"{document.file or folder / 'description'}: urdf")
-    )
+    if schema.urdf.lstrip().startswith("<"):
+        text = schema.urdf
+        urdf = Path(f"{document.file or folder / 'description'}: urdf")
+    else:
+        text = None
+        urdf = folder / schema.urdf
     with document.annotate_errors(("urdf",)):
         model, collision, visual = load_urdf(urdf, text=text)
         coordinates = Coordinates(model)
     names = coordinates.names
     links = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
-    velocity = coordinates.velocity.copy()
-    acceleration = np.full(coordinates.size, DEFAULT_ACCELERATION)
-    velocity[np.isinf(velocity)] = DEFAULT_VELOCITY
-    for joint, limits in schema.joints.items():
-        if joint not in names:
-            raise document.make_unknown_name_error(("joints", joint), "joint", joint, names)
-        index = coordinates.index(joint)
-        velocity[index] = limits.velocity or velocity[index]
-        acceleration[index] = limits.acceleration or acceleration[index]
+    velocity, acceleration = _read_rate_limits(document, schema, coordinates)
     if not (velocity > 0.0).all():
-        slow = names[int(np.argmin(velocity))]
-        problem, field = "the velocity limit must be positive", f"{slow}.limit.velocity"
-        raise InputError(problem, file=urdf, field=field, expected="> 0", got=velocity.min())
+        slowest = names[int(np.argmin(velocity))]
+        raise InputError(
+            "the velocity limit must be positive",
+            file=urdf,
+            field=f"{slowest}.limit.velocity",
+            expected="> 0",
+            got=velocity.min(),
+        )
     if schema.mass is not None:
         if not schema.free:
             problem = "`mass` applies to free objects only"
             expected = "masses of links in its URDF, or free: true"
             raise document.make_error(("mass",), problem, expected=expected, got=schema.mass)
         set_mass(model, collision, schema.mass)
-    attachments: dict[str, Attachment] = {}
-    for index, item in enumerate(schema.attachments):
-        if item.link not in links:
-            raise document.make_unknown_name_error(
-                ("attachments", index, "link"), "link", item.link, links
-            )
-        if item.name in attachments:
-            raise document.make_error(
-                ("attachments", index, "name"),
-                "this attachment name is already used",
-                expected="a new name",
-                got=item.name,
-            )
-        if schema.free and item.contact == "push":
-            problem = "free objects cannot be pushed, since no joint guides them"
-            raise document.make_error(
-                ("attachments", index, "contact"), problem, expected="grasp", got=item.contact
-            )
-        attachment = _build_attachment(item, firm=schema.free)
-        duplicates = {
-            name for other in attachments.values() for name in other.coordinates
-        }.intersection(attachment.coordinates)
-        if duplicates:  # "grip_slide" beside a "grip" that slides
-            problem, got = "its coordinate's name is already used", ", ".join(duplicates)
-            raise document.make_error(
-                ("attachments", index, "name"), problem, expected="a new name", got=got
-            )
-        attachments[item.name] = attachment
+    attachments = _build_attachments(document, schema, links)
     return ArticulatedObject(
         name=name or str(model.name),
         urdf=urdf if text is None else None,
@@ -291,10 +257,69 @@ def build_object(document: Document, folder: Path, name: str | None = None) -> A
     )
 
 
+def _read_rate_limits(
+    document: Document, schema: ObjectSchema, coordinates: Coordinates
+) -> tuple[Floats, Floats]:
+    """Return velocity and acceleration limits: those of the description, or else of the URDF."""
+    velocity = coordinates.velocity.copy()
+    velocity[np.isinf(velocity)] = DEFAULT_VELOCITY
+    acceleration = np.full(coordinates.size, DEFAULT_ACCELERATION)
+    for joint, limits in schema.joints.items():
+        if joint not in coordinates.names:
+            raise document.make_unknown_name_error(
+                ("joints", joint), "joint", joint, coordinates.names
+            )
+        index = coordinates.index(joint)
+        velocity[index] = limits.velocity or velocity[index]
+        acceleration[index] = limits.acceleration or acceleration[index]
+    return velocity, acceleration
+
+
+def _build_attachments(
+    document: Document, schema: ObjectSchema, links: Sequence[str]
+) -> dict[str, Attachment]:
+    """Build the attachments of a description, by name."""
+    attachments = dict[str, Attachment]()
+    coordinates = set[str]()
+    for index, item in enumerate(schema.attachments):
+        if item.link not in links:
+            raise document.make_unknown_name_error(
+                ("attachments", index, "link"), "link", item.link, links
+            )
+        if item.name in attachments:
+            raise document.make_error(
+                ("attachments", index, "name"),
+                "this attachment name is already used",
+                expected="a new name",
+                got=item.name,
+            )
+        if schema.free and item.contact == "push":
+            raise document.make_error(
+                ("attachments", index, "contact"),
+                "free objects cannot be pushed, since no joint guides them",
+                expected="grasp",
+                got=item.contact,
+            )
+        attachment = _build_attachment(item, firm=schema.free)
+        # For example, "grip_slide" is a coordinate of a "grip" that slides.
+        duplicates = coordinates.intersection(attachment.coordinates)
+        if duplicates:
+            raise document.make_error(
+                ("attachments", index, "name"),
+                "its coordinate's name is already used",
+                expected="a new name",
+                got=", ".join(duplicates),
+            )
+        attachments[item.name] = attachment
+        coordinates.update(attachment.coordinates)
+    return attachments
+
+
 def _build_attachment(item: AttachmentSchema, *, firm: bool) -> Attachment:
     """Build an attachment; `firm` is the default where the description has none."""
     if item.approach is not None and item.closing is not None:
-        z, x = (np.array(v) / np.linalg.norm(v) for v in (item.approach, item.closing))
+        z = np.array(item.approach) / np.linalg.norm(item.approach)
+        x = np.array(item.closing) / np.linalg.norm(item.closing)
         rotation = np.column_stack([x, np.cross(z, x), z])
     elif item.quaternion is not None:
         rotation = pin.Quaternion(np.array(item.quaternion)).matrix()
@@ -318,31 +343,37 @@ def _build_freedoms(item: AttachmentSchema) -> tuple[Freedom, ...]:
     if item.freedoms:
         return tuple(_build_freedom(freedom) for freedom in item.freedoms)
     if item.joint == "spherical":
-        limits = item.limits or (-np.pi, np.pi)
-        return tuple(
-            Freedom(f"_{name}", "revolute", axis, *limits)
-            for name, axis in zip("xyz", np.eye(3), strict=True)
+        lower, upper = item.limits or (-np.pi, np.pi)
+        x_axis, y_axis, z_axis = np.eye(3)
+        return (
+            Freedom("_x", "revolute", x_axis, lower, upper),
+            Freedom("_y", "revolute", y_axis, lower, upper),
+            Freedom("_z", "revolute", z_axis, lower, upper),
         )
-    if item.axis is None or item.limits is None:  # a fixed grasp, guaranteed by the schema
+    # By the schema, only a fixed grasp has no axis and no limits.
+    if item.axis is None or item.limits is None:
         return ()
     axis = np.array(item.axis) / np.linalg.norm(item.axis)
-    if item.turn is not None:
-        return Freedom("_slide", "prismatic", axis, *item.limits), Freedom(
-            "_turn", "revolute", axis, *item.turn
-        )
-    return (Freedom("", item.joint, axis, *item.limits),)
+    lower, upper = item.limits
+    if item.turn is None:
+        return (Freedom("", item.joint, axis, lower, upper),)
+    turn_lower, turn_upper = item.turn
+    return (
+        Freedom("_slide", "prismatic", axis, lower, upper),
+        Freedom("_turn", "revolute", axis, turn_lower, turn_upper),
+    )
 
 
 def _build_freedom(item: FreedomSchema) -> Freedom:
-    kind, given = ("revolute", item.turn) if item.slide is None else ("prismatic", item.slide)
-    axis = np.array(given, float)
-    return Freedom(
-        f"_{item.name}",
-        kind,
-        axis / np.linalg.norm(axis),
-        *item.limits,
-        np.array(item.through or (0.0, 0.0, 0.0)),
-    )
+    if item.slide is None:
+        kind = "revolute"
+        axis = np.array(item.turn, float)
+    else:
+        kind = "prismatic"
+        axis = np.array(item.slide, float)
+    lower, upper = item.limits
+    through = np.array(item.through or (0.0, 0.0, 0.0))
+    return Freedom(f"_{item.name}", kind, axis / np.linalg.norm(axis), lower, upper, through)
 
 
 def _read_own_pairs(
@@ -369,31 +400,38 @@ def _build_latches(
 ) -> tuple[Latch, ...]:
     latches = []
     for number, item in enumerate(schema.latches):
-        at = ("latches", number)
-        for role, joint, value in (
-            ("joint", item.joint, item.held_at),
-            ("released_by", item.released_by, item.threshold),
+        field = ("latches", number)
+        for joint_key, joint, position_key, position in (
+            ("joint", item.joint, "held_at", item.held_at),
+            ("released_by", item.released_by, "threshold", item.threshold),
         ):
             if joint not in coordinates.names:
                 raise document.make_unknown_name_error(
-                    (*at, role), "joint", joint, coordinates.names
+                    (*field, joint_key), "joint", joint, coordinates.names
                 )
             index = coordinates.index(joint)
-            lower, upper = coordinates.lower[index], coordinates.upper[index]
-            if not lower <= value <= upper:
-                key = "held_at" if role == "joint" else "threshold"
+            lower = coordinates.lower[index]
+            upper = coordinates.upper[index]
+            if not lower <= position <= upper:
                 raise document.make_error(
-                    (*at, key),
+                    (*field, position_key),
                     f"outside the limits of {joint}",
                     expected=f"{lower:g} to {upper:g}",
-                    got=value,
+                    got=position,
                 )
         if item.joint == item.released_by:
-            problem = "a joint cannot release itself"
             raise document.make_error(
-                (*at, "released_by"), problem, expected="another joint", got=item.released_by
+                (*field, "released_by"),
+                "a joint cannot release itself",
+                expected="another joint",
+                got=item.released_by,
             )
-        latches.append(
-            Latch(item.joint, item.held_at, item.released_by, item.threshold, item.engaged_within)
+        latch = Latch(
+            joint=item.joint,
+            held_at=item.held_at,
+            released_by=item.released_by,
+            threshold=item.threshold,
+            engaged_within=item.engaged_within,
         )
+        latches.append(latch)
     return tuple(latches)

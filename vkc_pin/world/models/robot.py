@@ -117,14 +117,16 @@ class Robot:
         turns = [k for k, unit in enumerate(self.coordinates.units) if k > 2 and unit == "rad"]
         if not turns:
             return _MIN_LEVER
-        low, high = np.maximum(self.lower, -np.pi), np.minimum(self.upper, np.pi)
+        low = np.maximum(self.lower, -np.pi)
+        high = np.maximum(low, np.minimum(self.upper, np.pi))
         squares = np.zeros(len(turns))
-        for z in rng.uniform(low, np.maximum(low, high), (_LEVER_SAMPLES, len(low))):
-            jacobian = pin.computeFrameJacobian(
-                self.model, data, self.coordinates.q(z), frame, pin.LOCAL_WORLD_ALIGNED
-            )
+        for z in rng.uniform(low, high, (_LEVER_SAMPLES, len(low))):
+            q = self.coordinates.q(z)
+            jacobian = pin.computeFrameJacobian(self.model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
+            # Columns of the translational part are the hand's velocities at 1 rad/s.
             squares += (jacobian[:3, turns] ** 2).sum(axis=0)
-        return max(float(np.sqrt(squares / _LEVER_SAMPLES).mean()), _MIN_LEVER)
+        root_mean_squares = np.sqrt(squares / _LEVER_SAMPLES)
+        return max(float(root_mean_squares.mean()), _MIN_LEVER)
 
     @cached_property
     def frame_names(self) -> tuple[str, ...]:
@@ -159,23 +161,21 @@ class Robot:
 
         It is the largest extent of the touch links along the direction of approach.
         """
-        frame = self.model.frames[self.model.getFrameId(self.tool_frame)]
-        ahead = coal.Halfspace(np.array([0.0, 0.0, -1.0]), -_FRONT_DISTANCE)  # beyond the hand
-        tool_shapes = [
-            s for s in self.collision.geometryObjects if s.parentJoint == frame.parentJoint
-        ]
-        hand = [
-            (s.geometry, frame.placement.actInv(s.placement))
-            for s in tool_shapes
-            if get_link_name(s.name) in self.touch_links
-        ]
-        gaps = [
-            compute_shape_distance(geometry, where, ahead, pin.SE3.Identity())
-            for geometry, where in hand
-        ]
-        return pin.SE3(
-            np.eye(3), np.array([0.0, 0.0, _FRONT_DISTANCE - min(gaps, default=_FRONT_DISTANCE)])
-        )
+        tool = self.model.frames[self.model.getFrameId(self.tool_frame)]
+        # The half-space z ≥ D of the tool frame, beyond the hand: a shape with the largest
+        # extent e along z is D − e away from it.
+        wall = coal.Halfspace(np.array([0.0, 0.0, -1.0]), -_FRONT_DISTANCE)
+        gaps = list[float]()
+        for shape in self.collision.geometryObjects:
+            is_on_hand = shape.parentJoint == tool.parentJoint
+            if is_on_hand and get_link_name(shape.name) in self.touch_links:
+                shape_in_tool = tool.placement.actInv(shape.placement)
+                distance = compute_shape_distance(
+                    shape.geometry, shape_in_tool, wall, pin.SE3.Identity()
+                )
+                gaps.append(distance)
+        extent = _FRONT_DISTANCE - min(gaps, default=_FRONT_DISTANCE)
+        return pin.SE3(np.eye(3), np.array([0.0, 0.0, extent]))
 
     @cached_property
     def fingerprint(self) -> str:
@@ -183,22 +183,24 @@ class Robot:
 
         It covers shapes and their placements, limits, home, links and joints.
         """
-        digest, data = hashlib.sha256(), self.model.createData()
+        digest = hashlib.sha256()
         for joint in self.file.root.findall("joint"):
-            ends = [
-                element.get("link")
-                for key in ("parent", "child")
-                if (element := joint.find(key)) is not None
-            ]
+            ends = []
+            for key in ("parent", "child"):
+                element = joint.find(key)
+                if element is not None:
+                    ends.append(element.get("link"))
             digest.update(repr((joint.get("name"), joint.get("type"), ends)).encode())
         digest.update(repr((self.coordinates.names, list(self.model.parents))).encode())
         for values in (self.lower, self.upper, self.home):
             digest.update(np.asarray(values, float).tobytes())
         # Placements at three configurations capture axes and placements of joints.
+        data = self.model.createData()
         configurations = np.random.default_rng(0).uniform(-3.0, 3.0, (3, len(self.lower)))
         for z in configurations:
             pin.forwardKinematics(self.model, data, self.coordinates.q(z))
-            digest.update(np.array([place.homogeneous for place in data.oMi]).tobytes())
+            placements = np.array([placement.homogeneous for placement in data.oMi])
+            digest.update(placements.tobytes())
         for shape in self.collision.geometryObjects:
             solid = shape.geometry
             digest.update(repr((shape.name, shape.parentJoint, type(solid).__name__)).encode())
@@ -218,7 +220,9 @@ class Robot:
 
         Returns None, which stands for the rest position, if `asked` is None or there is no gripper.
         """
-        return None if asked is None or self.gripper is None else self.gripper.clamp_opening(asked)
+        if asked is None or self.gripper is None:
+            return None
+        return self.gripper.clamp_opening(asked)
 
     def opened(self, opening: float | None) -> Robot:
         """Return a copy of the robot with its fingers locked at an opening.
@@ -242,15 +246,16 @@ class Robot:
                 got=opening,
             )
         if opening not in self._opened:
-            model, collision = pin.Model(self.model), self.collision.copy()
+            model = pin.Model(self.model)
             for name, placement in self.gripper.compute_frames(opening).items():
                 model.frames[model.getFrameId(name)].placement = placement
+            collision = self.collision.copy()
             for shape in collision.geometryObjects:
-                old, new = (
-                    there.frames[shape.parentFrame].placement for there in (self.model, model)
-                )
-                if old != new:
-                    shape.placement = round_placement(new * old.actInv(shape.placement))
+                before = self.model.frames[shape.parentFrame].placement
+                after = model.frames[shape.parentFrame].placement
+                if before != after:
+                    shape_in_link = before.actInv(shape.placement)
+                    shape.placement = round_placement(after * shape_in_link)
             self._opened[opening] = dataclasses.replace(
                 self, model=model, collision=collision, _opened={}
             )
@@ -262,9 +267,11 @@ class Robot:
 
         They are the robot's position limits, but a fixed base may be placed anywhere.
         """
-        lower, upper = self.lower.copy(), self.upper.copy()
+        lower = self.lower.copy()
+        upper = self.upper.copy()
         if self.base == "fixed":
-            lower[:3], upper[:3] = -np.inf, np.inf
+            lower[:3] = -np.inf
+            upper[:3] = np.inf
         return lower, upper
 
     def __repr__(self) -> str:
@@ -279,10 +286,9 @@ class Robot:
         Raises:
             InputError: The shape does not exist.
         """
-        geometry = check_integer(
-            geometry, "geometry", low=0, high=len(self.collision.geometryObjects) - 1
-        )
-        return get_link_name(self.collision.geometryObjects[geometry].name)
+        shapes = self.collision.geometryObjects
+        geometry = check_integer(geometry, "geometry", low=0, high=len(shapes) - 1)
+        return get_link_name(shapes[geometry].name)
 
     def own_margin(self, links: tuple[str, str], margin: float) -> float:
         """Return the margin of a sorted pair of links: `margin` or half of `tight`, if less [m]."""
@@ -296,15 +302,15 @@ class Robot:
         Args:
             margin: Margin of pairs that are not tight: `Options.self_distance` [m].
         """
-        found, links = {}, [get_link_name(shape.name) for shape in self.collision.geometryObjects]
+        links = [get_link_name(shape.name) for shape in self.collision.geometryObjects]
+        margins = {}
         for pair in self.collision.collisionPairs:
             one, other = sorted((links[pair.first], links[pair.second]))
-            found[pair.first, pair.second] = self.own_margin((one, other), margin)
-        return found
+            margins[pair.first, pair.second] = self.own_margin((one, other), margin)
+        return margins
 
     @property
     def links(self) -> tuple[str, ...]:
         """Links that have collision geometry, each once."""
-        return tuple(
-            dict.fromkeys(get_link_name(shape.name) for shape in self.collision.geometryObjects)
-        )
+        names = [get_link_name(shape.name) for shape in self.collision.geometryObjects]
+        return tuple(dict.fromkeys(names))

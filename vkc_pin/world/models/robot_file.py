@@ -62,10 +62,8 @@ _ALIASES = {
 
 def list_robots() -> dict[str, Path]:
     """Return robot name → file: robots in robots/, then those of example-robot-data."""
-    known = {
-        path.parent.name: path
-        for path in sorted(resources.find_resource_folder("robots").glob("*/robot.yaml"))
-    }
+    own_folder = resources.find_resource_folder("robots")
+    known = {path.parent.name: path for path in sorted(own_folder.glob("*/robot.yaml"))}
     folder = resources.find_example_robot_data()
     if folder is not None:
         files = sorted(folder.glob("robots/*/*/*.urdf"))
@@ -87,7 +85,8 @@ def find_robot(name: str | Path) -> Path:
             robot.yaml. Strings with a slash or the suffix of such a file are paths.
     """
     path = Path(name)
-    if isinstance(name, Path) or path.suffix.lower() in (".urdf", ".yaml", ".yml") or "/" in name:
+    has_suffix = path.suffix.lower() in (".urdf", ".yaml", ".yml")
+    if isinstance(name, Path) or has_suffix or "/" in name:
         file = path / "robot.yaml" if path.is_dir() else path
         if not file.is_file():
             raise InputError(
@@ -166,54 +165,50 @@ def load_robot(  # noqa: PLR0913 - keyword options of a public call
         InputError: A file or value is invalid, no joint can be planned, or the SRDF exempts all
             pairs of links that can collide.
     """
-    locked_joints, home = _check_arguments(base, pairs, tool_frame, arm, locked_joints, home)
-    files = _read_files(
-        name,
-        check_mapping(
-            {} if packages is None else packages, "packages", "packages, each with its folder"
-        ),
+    _check_choice(base, _BASES, "base", "kind of base")
+    _check_choice(pairs, _PAIRS, "pairs", "source of pairs")
+    _check_tool(tool_frame, arm)
+    locked_joints = _check_positions(locked_joints, "locked_joints")
+    home = _check_positions(home, "home")
+    folders = check_mapping(
+        {} if packages is None else packages, "packages", "packages, each with its folder"
     )
-    urdf, settings = files.urdf, files.settings
-    srdf_path = check_path(srdf, "srdf") if srdf is not None else files.find_srdf()
+    files = _read_files(name, folders)
+    urdf = files.urdf
+    settings = files.settings
+    srdf_path = files.find_srdf() if srdf is None else check_path(srdf, "srdf")
     group = files.find_group(arm, tool_frame)
     semantics = files.read_semantics(srdf_path, pairs, group)
     full = build_full_model(urdf)
     tool = tool_frame
     if tool is None:
-        tool = files.find_tool_frame(semantics, group, srdf_path)
-    if tool is None:
-        tool = find_default_tool_frame(full, urdf)
+        tool = files.find_tool_frame(semantics, group, srdf_path, full)
     if pairs != "srdf":
         semantics = None
-    if tool not in (frames := dict.fromkeys(frame.name for frame in full.frames)):
+    frames = dict.fromkeys(frame.name for frame in full.frames)
+    if tool not in frames:
         raise UnknownNameError("frame", tool, frames, file=urdf.path, field="tool_frame")
     full = tighten_coupled_limits(full, urdf, tool)
     _warn_of_misplaced_axle(full, urdf, tool, base)
     base_joints = find_base_joints(full, urdf) if base != "fixed" else ()
-    fingers = {joint: finger.open for joint, finger in settings.gripper.items()}
-    stated_positions = {**settings.locked_joints, **locked_joints}
-    locked = {**fingers, **dict.fromkeys(base_joints, 0.0), **stated_positions}
-    known_positions = {**settings.home, **home, **locked}
-    rest = compute_rest_positions(full, urdf, known_positions)
-    files.check_names(rest)
-    for joint in known_positions:
-        field = "home" if joint in home else "locked_joints"
-        if joint not in rest:
-            raise UnknownNameError("joint", joint, rest, file=urdf.path, field=field)
-        if joint in stated_positions or joint not in (*base_joints, *fingers):
-            files.check_limits(full, joint, known_positions[joint], field)
-    if unstated := ", ".join(joint for joint in base_joints if joint not in stated_positions):
+    positions = _collect_positions(files, full, base_joints, locked_joints, home)
+    unstated = [joint for joint in base_joints if joint not in positions.stated_locked]
+    if unstated:
         problem = "the virtual base replaces the joints of the robot's base, which are locked"
-        warnings.warn(f"{urdf.path}: {problem}: {unstated}", stacklevel=2)
+        warnings.warn(f"{urdf.path}: {problem}: {', '.join(unstated)}", stacklevel=2)
     root_height = settings.base.height if height is None else check_coordinate(height, "height")
-    rest = {**rest, **locked}
-    model = build_planned_model(full, urdf, tool, rest, locked, height=root_height)
+    rest = positions.rest
+    model = build_planned_model(full, urdf, tool, rest, positions.locked, height=root_height)
     coordinates, lower, upper, velocity, acceleration = apply_robot_limits(
         full, model, settings, base
     )
-    given = dict.fromkeys((*settings.home, *home), "home")
-    files.check_followers(rest, given | dict.fromkeys(stated_positions, "locked_joints"))
-    state = _read_rest_state(model, coordinates.names[3:], semantics, group, known_positions)
+    arm_joints = coordinates.names[3:]
+    stated_fields = dict.fromkeys(positions.stated_home, "home")
+    stated_fields.update(dict.fromkeys(positions.stated_locked, "locked_joints"))
+    files.check_followers(rest, stated_fields)
+    known = {*positions.stated_home, *positions.locked}
+    state = _read_rest_state(model, arm_joints, semantics, group, known)
+    home_positions = [state.get(joint, rest[joint]) for joint in arm_joints]
     collision = load_collision_geometry(model, urdf)
     robot = Robot(
         name=files.name,
@@ -226,9 +221,7 @@ def load_robot(  # noqa: PLR0913 - keyword options of a public call
         velocity=velocity,
         acceleration=acceleration,
         # Clipping removes rounding errors.
-        home=np.clip(
-            [{**rest, **state}[joint] for joint in coordinates.names[3:]], lower[3:], upper[3:]
-        ),
+        home=np.clip(home_positions, lower[3:], upper[3:]),
         tool_frame=tool,
         base=base,
         touch_links=settings.touch_links,
@@ -251,39 +244,76 @@ def load_robot(  # noqa: PLR0913 - keyword options of a public call
     if pairs == "all":
         robot = set_collision_pairs(robot, ())
     else:
-        loose_joints = [
-            joint
-            for joint in coordinates.names[3:]
-            if joint not in known_positions and joint not in state
-        ]
+        loose_joints = [joint for joint in arm_joints if joint not in {*known, *state}]
         robot = apply_self_collision_analysis(robot, semantics, loose_joints, samples=_SAMPLES)
-    _check_pairs_left(robot, semantics)
+    _check_remaining_pairs(robot, semantics)
     return robot
 
 
-def _check_arguments(
-    base: Base,
-    pairs: str,
-    tool_frame: str | None,
-    arm: str | None,
-    locked_joints: Mapping[str, float] | None,
-    home: Mapping[str, float] | None,
-) -> tuple[Mapping[str, float], Mapping[str, float]]:
-    """Check arguments of `load_robot`, and return locked joints and home positions."""
-    for value, field, choices, kind in (
-        (base, "base", _BASES, "kind of base"),
-        (pairs, "pairs", _PAIRS, "source of pairs"),
-    ):
-        if not isinstance(value, str) or value not in choices:
-            raise InputError(
-                f"wrong {kind}", field=field, expected=" or ".join(choices), got=format_value(value)
-            )
-    for field, given_name, kind in (
-        ("tool_frame", tool_frame, "the name of a frame"),
-        ("arm", arm, "the name of a group"),
-    ):
-        if given_name is not None:
-            check_text(given_name, field, kind)
+@dataclass(frozen=True, eq=False)
+class _Positions:
+    """Positions of a robot's joints, [m] or [rad].
+
+    Attributes:
+        stated_home: Home positions in arguments, or else in the robot.yaml.
+        stated_locked: Positions of locked joints in arguments, or else in the robot.yaml.
+        locked: Positions of all joints to lock: also of open fingers, and of the joints that the
+            virtual base replaces.
+        rest: Position of each joint; see `robot_model.compute_rest_positions`.
+    """
+
+    stated_home: Mapping[str, float]
+    stated_locked: Mapping[str, float]
+    locked: Mapping[str, float]
+    rest: Mapping[str, float]
+
+
+def _collect_positions(
+    files: _RobotFiles,
+    full: pin.Model,
+    base_joints: Collection[str],
+    locked_joints: Mapping[str, float],
+    home: Mapping[str, float],
+) -> _Positions:
+    """Collect and check the positions of all joints.
+
+    Args:
+        files: Files of the robot.
+        full: The robot with all joints.
+        base_joints: Joints that the virtual base replaces.
+        locked_joints: Positions of locked joints in arguments.
+        home: Home positions in arguments.
+    """
+    settings = files.settings
+    stated_home = {**settings.home, **home}
+    stated_locked = {**settings.locked_joints, **locked_joints}
+    open_fingers = {joint: finger.open for joint, finger in settings.gripper.items()}
+    locked = {**open_fingers, **dict.fromkeys(base_joints, 0.0), **stated_locked}
+    known = {**stated_home, **locked}
+    rest = compute_rest_positions(full, files.urdf, known)
+    files.check_names(rest)
+    for joint, position in known.items():
+        field = "home" if joint in home else "locked_joints"
+        if joint not in rest:
+            raise UnknownNameError("joint", joint, rest, file=files.urdf.path, field=field)
+        if joint in stated_locked or joint not in (*base_joints, *open_fingers):
+            files.check_limits(full, joint, position, field)
+    rest.update(locked)
+    return _Positions(stated_home, stated_locked, locked, rest)
+
+
+def _check_choice(value: object, choices: Sequence[str], field: str, kind: str) -> None:
+    if not isinstance(value, str) or value not in choices:
+        expected = " or ".join(choices)
+        raise InputError(f"wrong {kind}", field=field, expected=expected, got=format_value(value))
+
+
+def _check_tool(tool_frame: str | None, arm: str | None) -> None:
+    """Check that at most one of the two arguments that name the tool is given."""
+    if tool_frame is not None:
+        check_text(tool_frame, "tool_frame", "the name of a frame")
+    if arm is not None:
+        check_text(arm, "arm", "the name of a group")
     if arm is not None and tool_frame is not None:
         raise InputError(
             "`arm` and `tool_frame` exclude each other",
@@ -291,15 +321,17 @@ def _check_arguments(
             expected="one of them",
             got=f"{arm}, {tool_frame}",
         )
+
+
+def _check_positions(values: Mapping[str, float] | None, field: str) -> dict[str, float]:
+    """Return the positions of joints that an argument states."""
+    stated = check_mapping(
+        {} if values is None else values, field, "joints, each with its position"
+    )
     positions = {}
-    for field, values in (("locked_joints", locked_joints), ("home", home)):
-        checked = check_mapping(
-            {} if values is None else values, field, "joints, each with its position"
-        )
-        positions[field] = {
-            joint: check_coordinate(value, f"{field}.{joint}") for joint, value in checked.items()
-        }
-    return positions["locked_joints"], positions["home"]
+    for joint, value in stated.items():
+        positions[joint] = check_coordinate(value, f"{field}.{joint}")
+    return positions
 
 
 @dataclass(frozen=True, eq=False)
@@ -314,11 +346,9 @@ class _RobotFiles:
     @property
     def name(self) -> str:
         """Name of the robot, which is that of its folder or its file."""
-        return (
-            self.source.resolve().parent.name
-            if self.source.name == "robot.yaml"
-            else self.source.stem
-        )
+        if self.source.name == "robot.yaml":
+            return self.source.resolve().parent.name
+        return self.source.stem
 
     def find_srdf(self) -> Path | None:
         """Return the path of the SRDF named in robot.yaml, or of one beside the URDF, or None."""
@@ -333,7 +363,7 @@ class _RobotFiles:
         return self.settings.arm
 
     def read_semantics(self, srdf: Path | None, pairs: str, group: str | None) -> Srdf | None:
-        """Return the SRDF if its pairs or groups are needed; warn of what it names in vain."""
+        """Return the SRDF if its pairs or groups are needed; warn with its notes."""
         if srdf is None or (pairs != "srdf" and group is None):
             return None
         semantics = read_srdf(srdf, self.urdf.root)
@@ -342,15 +372,16 @@ class _RobotFiles:
         return semantics
 
     def find_tool_frame(
-        self, semantics: Srdf | None, group: str | None, srdf: Path | None
-    ) -> str | None:
-        """Return the tip of the group that is planned, or the frame of robot.yaml, or None.
+        self, semantics: Srdf | None, group: str | None, srdf: Path | None, full: pin.Model
+    ) -> str:
+        """Return the tip of the group that is planned, the frame of robot.yaml, or the default.
 
         Raises:
             UnknownNameError: There is no such group, or no SRDF.
         """
         if group is None:
-            return self.settings.tool_frame
+            stated = self.settings.tool_frame
+            return find_default_tool_frame(full, self.urdf) if stated is None else stated
         groups = {} if semantics is None else semantics.groups
         if group not in groups:
             raise UnknownNameError("group of an SRDF", group, groups, file=srdf, field="arm")
@@ -408,20 +439,22 @@ def _read_files(name: str | Path, packages: Mapping[str, str | Path]) -> _RobotF
     """Find and read a robot's URDF and its robot.yaml, if there is one."""
     check_path(name, "name", "a robot's name, or a path")
     source = find_robot(name)
-    document = Document({})
-    settings = RobotSchema(urdf=source.name)
-    if source.suffix != ".yaml" and (source.parent / "robot.yaml").is_file():
-        srdf_path, _ = read_robot(source.parent / "robot.yaml")
-        source = source.parent / "robot.yaml" if srdf_path.urdf == source.name else source
+    settings_file = source.parent / "robot.yaml"
+    if source.suffix != ".yaml" and settings_file.is_file():
+        # The robot.yaml may describe another URDF of its folder.
+        neighbour_settings, _ = read_robot(settings_file)
+        if neighbour_settings.urdf == source.name:
+            source = settings_file
     if source.suffix == ".yaml":
         settings, document = read_robot(source)
-    folders = {
-        key: check_path(folder, f"packages.{key}", "a folder") for key, folder in packages.items()
-    }
-    folders = {
-        **find_python_packages(tuple(p for p in settings.packages if p not in folders), document),
-        **folders,
-    }
+    else:
+        settings = RobotSchema(urdf=source.name)
+        document = Document({})
+    stated_folders = {}
+    for package, folder in packages.items():
+        stated_folders[package] = check_path(folder, f"packages.{package}", "a folder")
+    missing = [package for package in settings.packages if package not in stated_folders]
+    folders = {**find_python_packages(tuple(missing), document), **stated_folders}
     urdf = read_urdf(source.parent / settings.urdf, folders)
     apply_couplings(urdf, settings.couplings, document)
     return _RobotFiles(source, settings, document, urdf)
@@ -430,10 +463,11 @@ def _read_files(name: str | Path, packages: Mapping[str, str | Path]) -> _RobotF
 def find_robot_files(name: str | Path) -> tuple[Path | None, Path | None]:
     """Return the robot.yaml and the SRDF that `load_robot` reads for a robot, or None each."""
     files = _read_files(name, {})
-    return files.source if files.source.suffix == ".yaml" else None, files.find_srdf()
+    settings_file = files.source if files.source.suffix == ".yaml" else None
+    return settings_file, files.find_srdf()
 
 
-def _check_pairs_left(robot: Robot, semantics: Srdf | None) -> None:
+def _check_remaining_pairs(robot: Robot, semantics: Srdf | None) -> None:
     """Check that an SRDF leaves a pair of links to check, unless none can collide."""
     if len(robot.collision.collisionPairs) or semantics is None:
         return
@@ -453,10 +487,9 @@ def _warn_of_misplaced_axle(full: pin.Model, urdf: UrdfFile, tool: str, base: Ba
     path = [str(full.names[joint]) for joint in find_joint_path(full, tool)]
     drive = find_drive(full, urdf, path)
     if drive is not None and not is_on_axle(drive):
-        text = f"{urdf.path}: {describe_misplaced_axle(drive)}"
-        warnings.warn(
-            f"{text}: its wheels will slide sideways; `vkc-pin doctor` names the axle", stacklevel=3
-        )
+        problem = describe_misplaced_axle(drive)
+        consequence = "its wheels will slide sideways; `vkc-pin doctor` names the axle"
+        warnings.warn(f"{urdf.path}: {problem}: {consequence}", stacklevel=3)
 
 
 def _read_rest_state(
@@ -467,9 +500,11 @@ def _read_rest_state(
     known_positions: Collection[str],
 ) -> dict[str, float]:
     """Return the home positions of an arm's joints in an SRDF, without those already known."""
-    state = {} if semantics is None else semantics.find_home(arm, group)
-    return {
-        joint: find_nearest_position(model, joint, state[joint])
-        for joint in arm
-        if joint in state and joint not in known_positions
-    }
+    if semantics is None:
+        return {}
+    state = semantics.find_home(arm, group)
+    positions = {}
+    for joint in arm:
+        if joint in state and joint not in known_positions:
+            positions[joint] = find_nearest_position(model, joint, state[joint])
+    return positions

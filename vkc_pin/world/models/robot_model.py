@@ -60,44 +60,36 @@ def build_planned_model(
         locked: Positions of planned joints to lock as well, [m] or [rad].
         height: Height of the root link above the base joint [m].
     """
-    follows, groups = find_followers(file.root), find_coupled_groups(full, file, tool_frame)
+    couplings = find_followers(file.root)
+    groups = find_coupled_groups(full, file, tool_frame)
     groups = {leader: group for leader, group in groups.items() if leader not in locked}
-    if stuck_joints := [
-        (joint, coupling.leader)
-        for group in groups.values()
-        for joint, coupling in group.items()
-        if joint in locked
-    ]:
-        problem = "a locked joint follows one that is not locked"
-        joint, leader = stuck_joints[0]
-        expected = "the joint that it follows in `locked_joints`"
-        raise InputError(
-            problem,
-            file=file.path,
-            field=f"locked_joints.{joint}",
-            expected=expected,
-            got=f"'{leader}' is not locked",
-        )
-    uncoupled = {str(full.names[j]) for j in find_joint_path(full, tool_frame) if j > 1} - {
-        *locked,
-        *follows,
-    }
+    for leader, group in groups.items():
+        for joint in group:
+            if joint in locked:
+                raise InputError(
+                    "a locked joint follows one that is not locked",
+                    file=file.path,
+                    field=f"locked_joints.{joint}",
+                    expected="the joint that it follows in `locked_joints`",
+                    got=f"'{leader}' is not locked",
+                )
+    path = {str(full.names[j]) for j in find_joint_path(full, tool_frame) if j > 1}
+    uncoupled = path - {*locked, *couplings}
     moving = uncoupled.union(groups, *groups.values())
-    planned = [
-        j for j in range(2, full.njoints) if full.names[j] in moving and full.names[j] in rest
-    ]
-    if not planned:
-        expected = "a frame moved by an arm"
+    planned = {1}  # the base
+    for j in range(2, full.njoints):
+        if full.names[j] in moving and full.names[j] in rest:
+            planned.add(j)
+    if len(planned) == 1:
         raise InputError(
             "no joint moves the tool frame",
             file=file.path,
             field="tool_frame",
-            expected=expected,
+            expected="a frame moved by an arm",
             got=tool_frame,
         )
-    return _lock_joints(
-        full, {1, *planned}, make_configuration(full, {**rest, **locked}), height, follows
-    )
+    q = make_configuration(full, {**rest, **locked})
+    return _lock_joints(full, planned, q, height, couplings)
 
 
 def build_unlocked_model(
@@ -112,15 +104,13 @@ def build_unlocked_model(
 
     Mimic joints among them become independent. For the other arguments, see `build_planned_model`.
     """
-    own, last = (
-        [full.getJointId(str(name)) for name in names] for names in (list(model.names)[1:], joints)
-    )
-    follows = {
-        joint: coupling
-        for joint, coupling in find_followers(file.root).items()
-        if joint not in joints
-    }
-    return _lock_joints(full, {*own, *last}, make_configuration(full, rest), height, follows, last)
+    own = [full.getJointId(str(name)) for name in list(model.names)[1:]]
+    last = [full.getJointId(str(name)) for name in joints]
+    couplings = find_followers(file.root)
+    for joint in joints:
+        couplings.pop(joint, None)
+    q = make_configuration(full, rest)
+    return _lock_joints(full, {*own, *last}, q, height, couplings, last)
 
 
 def compute_rest_positions(
@@ -133,10 +123,11 @@ def compute_rest_positions(
     """
     rest = {}
     for j in range(2, full.njoints):
+        name = full.names[j]
         if full.joints[j].nv == 1:
-            low, high = find_joint_limits(full, full.names[j])
+            low, high = find_joint_limits(full, name)
             default = 0.0 if low <= 0.0 <= high else 0.5 * (low + high)
-            rest[full.names[j]] = float(given.get(full.names[j], default))
+            rest[name] = float(given.get(name, default))
     for name, coupling in find_followers(file.root).items():
         if name in rest and coupling.leader in rest and name not in given:
             rest[name] = coupling.factor * rest[coupling.leader] + coupling.offset
@@ -157,11 +148,13 @@ def find_nearest_position(model: pin.Model, joint: str, position: float) -> floa
     Positions outside the limits are shifted by ±2π for revolute joints, or else clamped.
     """
     moving = model.joints[model.getJointId(joint)]
-    if moving.nq == 2:
+    is_continuous = moving.nq == 2
+    if is_continuous:
         return position
     low, high = find_joint_limits(model, joint)
-    turns = () if "JointModelP" in moving.shortname() else (2.0 * np.pi, -2.0 * np.pi)
-    for turn in (0.0, *turns):
+    is_prismatic = "JointModelP" in moving.shortname()
+    turns = (0.0,) if is_prismatic else (0.0, 2.0 * np.pi, -2.0 * np.pi)
+    for turn in turns:
         if low <= position + turn <= high:
             return float(position + turn)
     return float(np.clip(position, low, high))
@@ -175,25 +168,33 @@ def find_neighbours(
     Two links are adjacent if only links outside `links` lie between them. Two rigid bodies (links
     connected by fixed joints) are adjacent if a movable joint connects them.
     """
-    parents = dict[str, tuple[str, str]]()
+    parents = dict[str, tuple[str, str]]()  # link → parent link, type of the joint between them
     for joint in file.root.findall("joint"):
-        parent, child = joint.find("parent"), joint.find("child")
+        parent = joint.find("parent")
+        child = joint.find("child")
         if parent is not None and child is not None:
             parents[child.get("link", "")] = (parent.get("link", ""), joint.get("type", ""))
-    adjacent, body, parent_body = set[tuple[str, str]](), dict[str, str](), dict[str, str]()
+    adjacent = set[tuple[str, str]]()
+    # Rigid bodies are named after their root links.
+    bodies = dict[str, str]()
+    parent_bodies = dict[str, str]()
     for link in links:
         ancestor, _ = parents.get(link, ("", ""))
         while ancestor and ancestor not in links:
             ancestor, _ = parents.get(ancestor, ("", ""))
         if ancestor:
             adjacent.add((min(link, ancestor), max(link, ancestor)))
-        body[link] = _find_rigid_root(link, parents)
-        parent_body[link] = (
-            _find_rigid_root(parents[body[link]][0], parents) if body[link] in parents else ""
-        )
-    return adjacent, {
-        (min(a, b), max(a, b)) for a in links for b in links if parent_body[a] == body[b]
-    }
+        body = _find_rigid_root(link, parents)
+        bodies[link] = body
+        if body in parents:
+            parent_link, _ = parents[body]
+            parent_bodies[link] = _find_rigid_root(parent_link, parents)
+    adjacent_bodies = set[tuple[str, str]]()
+    for link, parent_body in parent_bodies.items():
+        for other in links:
+            if bodies[other] == parent_body:
+                adjacent_bodies.add((min(link, other), max(link, other)))
+    return adjacent, adjacent_bodies
 
 
 def _find_rigid_root(link: str, parents: Mapping[str, tuple[str, str]]) -> str:
@@ -210,78 +211,87 @@ def find_base_joints(full: pin.Model, file: UrdfFile) -> tuple[str, ...]:
     horizontal axes and a revolute or continuous one about the vertical axis, in any order, without
     collision shapes before the last one.
     """
-    data, slides, found, joint = full.createData(), list[Floats](), list[str](), 1
+    data = full.createData()
     pin.computeJointJacobians(full, data, pin.neutral(full))
-    solid = {shape.link for shape in file.read_shapes("collision")}
-    carries = {
-        frame.parentJoint
-        for frame in full.frames
-        if frame.type == pin.FrameType.BODY and frame.name in solid
-    }
+    links_with_shapes = {shape.link for shape in file.read_shapes("collision")}
+    joints_with_shapes = set[int]()
+    for frame in full.frames:
+        if frame.type == pin.FrameType.BODY and frame.name in links_with_shapes:
+            joints_with_shapes.add(frame.parentJoint)
+    directions = list[Floats]()
+    found = list[str]()
+    joint = 1
     while len(found) < 3:
         children = [j for j in range(2, full.njoints) if full.parents[j] == joint]
-        if joint in carries or len(children) != 1 or full.joints[children[0]].nv != 1:
+        if joint in joints_with_shapes or len(children) != 1:
             return ()
         (joint,) = children
-        twist = pin.getJointJacobian(full, data, joint, pin.LOCAL_WORLD_ALIGNED)[
-            :, full.joints[joint].idx_v
-        ]
-        if np.abs(twist[3:]).max() < _AXIS_TOLERANCE and abs(twist[2]) < _AXIS_TOLERANCE:
-            slides.append(twist[:2])
+        if full.joints[joint].nv != 1:
+            return ()
+        # Twist of the joint at unit velocity: linear velocity, then angular, in the axes of the
+        # world. A horizontal slide has (x, y, 0, 0, 0, 0), a vertical axis (·, ·, ·, 0, 0, ±1).
+        jacobian = pin.getJointJacobian(full, data, joint, pin.LOCAL_WORLD_ALIGNED)
+        twist = jacobian[:, full.joints[joint].idx_v]
+        is_slide = np.abs(twist[3:]).max() < _AXIS_TOLERANCE
+        if is_slide and abs(twist[2]) < _AXIS_TOLERANCE:
+            directions.append(twist[:2])
         elif abs(twist[5]) < 1.0 - _AXIS_TOLERANCE:
             return ()
         found.append(full.names[joint])
-    has_two_directions = (
-        len(slides) == 2
-        and abs(slides[0][0] * slides[1][1] - slides[0][1] * slides[1][0]) > _AXIS_TOLERANCE
-    )
-    return tuple(found) if has_two_directions else ()
+    if len(directions) != 2:
+        return ()
+    first, second = directions
+    sine = abs(first[0] * second[1] - first[1] * second[0])
+    return tuple(found) if sine > _AXIS_TOLERANCE else ()
 
 
 def make_configuration(model: pin.Model, positions: Mapping[str, float]) -> Floats:
     """Return the configuration with joints at `positions`, the others neutral, shape (nq,)."""
     q: Floats = pin.neutral(model)
     for j in range(1, model.njoints):
-        joint, value = model.joints[j], positions.get(model.names[j])
-        if value is not None and joint.nv == 1:
-            q[joint.idx_q : joint.idx_q + joint.nq] = (
-                value if joint.nq == 1 else (np.cos(value), np.sin(value))
-            )
+        joint = model.joints[j]
+        value = positions.get(model.names[j])
+        if value is None or joint.nv != 1:
+            continue
+        if joint.nq == 1:
+            q[joint.idx_q] = value
+        else:  # a continuous joint
+            q[joint.idx_q] = np.cos(value)
+            q[joint.idx_q + 1] = np.sin(value)
     return q
 
 
 def find_default_tool_frame(full: pin.Model, file: UrdfFile) -> str:
     """Return the last frame of the longest chain of joints, before it branches into fingers."""
-    follows = find_followers(file.root)
+    couplings = find_followers(file.root)
     children: dict[int, list[int]] = {j: [] for j in range(full.njoints)}
+    # Number of independent joints on the longest chain below each joint.
     depth = np.zeros(full.njoints, int)
     for j in range(full.njoints - 1, 1, -1):
-        children[full.parents[j]].insert(0, j)
-        counts = full.joints[j].nv == 1 and full.names[j] not in follows
-        depth[full.parents[j]] = max(depth[full.parents[j]], depth[j] + counts)
-    joint, joint_count = 1, 0
+        parent = full.parents[j]
+        children[parent].insert(0, j)
+        is_independent = full.joints[j].nv == 1 and full.names[j] not in couplings
+        depth[parent] = max(depth[parent], depth[j] + is_independent)
+    joint = 1
+    joint_count = 0
     while children[joint]:
-        hand = len(children[joint]) > 1 and depth[joint] <= _MAX_FINGER_JOINTS
-        if hand and joint_count >= _MIN_ARM_JOINTS:
+        is_hand = len(children[joint]) > 1 and depth[joint] <= _MAX_FINGER_JOINTS
+        if is_hand and joint_count >= _MIN_ARM_JOINTS:
             break
         joint = max(children[joint], key=lambda j: depth[j] + (full.joints[j].nv == 1))
-        joint_count = joint_count + 1
-    return str(
-        [
-            frame.name
-            for frame in full.frames
-            if frame.parentJoint == joint and frame.name != full.names[joint]
-        ][-1]
-    )
+        joint_count += 1
+    frames = [frame.name for frame in full.frames if frame.parentJoint == joint]
+    names = [name for name in frames if name != full.names[joint]]
+    return str(names[-1])
 
 
 def load_collision_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
     """Return the convex collision shapes of `file` on the joints of `model`, named `<link>_<k>`."""
     geometry = pin.GeometryModel()
     for shape in file.read_shapes_for_model("collision"):
-        geometry.addGeometryObject(
-            _make_geometry_object(model, shape, shape.name, shape.make_solid(), _GREY)
-        )
+        solid = shape.make_solid()
+        copy = _make_geometry_object(model, shape, shape.name, solid, _GREY)
+        geometry.addGeometryObject(copy)
     if len(geometry.geometryObjects) == 0:
         raise InputError(
             "this robot has no collision geometry",
@@ -301,19 +311,17 @@ def load_visual_geometry(model: pin.Model, file: UrdfFile) -> pin.GeometryModel:
     geometry = pin.GeometryModel()
     for shape in file.read_shapes_for_model("visual"):
         if shape.file is None:
-            geometry.addGeometryObject(
-                _make_geometry_object(
-                    model, shape, shape.name, shape.make_solid(), shape.colour or _GREY
-                )
-            )
+            solid = shape.make_solid()
+            colour = shape.colour or _GREY
+            copy = _make_geometry_object(model, shape, shape.name, solid, colour)
+            geometry.addGeometryObject(copy)
             continue
         parts = load_parts(shape.file, shape.size, detail=_MESH_DETAIL)
         for k, part in enumerate(parts):
             name = shape.name if len(parts) == 1 else f"{shape.name}_{k}"
             colour = shape.colour or part.colour or _GREY
-            geometry.addGeometryObject(
-                _make_geometry_object(model, shape, name, make_bvh(part), colour)
-            )
+            copy = _make_geometry_object(model, shape, name, make_bvh(part), colour)
+            geometry.addGeometryObject(copy)
     return geometry
 
 
@@ -322,47 +330,48 @@ def _lock_joints(
     planned: Collection[int],
     q: Floats,
     height: float,
-    follows: Mapping[str, JointCoupling],
+    couplings: Mapping[str, JointCoupling],
     last: Collection[int] = (),
 ) -> pin.Model:
     """Return `full` with all joints but `planned` locked at `q`; joints in `last` come last."""
+    coupled = dict[int, JointCoupling]()
+    before = dict[int, set[int]]()  # joint → joints that precede it in the model
+    for j in sorted(planned):
+        coupling = couplings.get(full.names[j])
+        if coupling is None:
+            continue
+        leader = full.getJointId(coupling.leader)
+        if leader in planned:
+            coupled[j] = coupling
+            before[j] = {leader}
+    for j in last:
+        before[j] = {*planned} - {*last}
     data = full.createData()
     pin.forwardKinematics(full, data, q)
     model = pin.Model()
     model.name = full.name
+    # Joint of `full` → the joint of the model that carries it, and its placement on that joint.
     placed = {0: (0, pin.SE3.Identity())}
-    coupled = {
-        j: coupling
-        for j in sorted(planned)
-        if (coupling := follows.get(full.names[j])) and full.getJointId(coupling.leader) in planned
-    }
-    before = {j: {full.getJointId(coupling.leader)} for j, coupling in coupled.items()} | {
-        j: {*planned} - {*last} for j in last
-    }
     for j in sort_joints(full, before):
-        joint, (parent, placement) = full.joints[j], placed[full.parents[j]]
+        parent, placement = placed[full.parents[j]]
         if j in planned:
-            index = add_joint(
-                model,
-                parent,
-                joint,
-                round_placement(placement * full.jointPlacements[j], _ROUNDING),
-                like=(full, j),
-            )
-            placed[j] = (index, pin.SE3(np.eye(3), np.array([0.0, 0.0, height if j == 1 else 0.0])))
+            joint_placement = round_placement(placement * full.jointPlacements[j], _ROUNDING)
+            carrier = add_joint(model, parent, full.joints[j], joint_placement, like=(full, j))
+            offset = np.array([0.0, 0.0, height if j == 1 else 0.0])
+            on_carrier = pin.SE3(np.eye(3), offset)
         else:
-            placed[j] = (parent, placement * data.liMi[j])
-        model.appendBodyToJoint(placed[j][0], full.inertias[j], placed[j][1])
+            carrier = parent
+            on_carrier = placement * data.liMi[j]
+        placed[j] = (carrier, on_carrier)
+        model.appendBodyToJoint(carrier, full.inertias[j], on_carrier)
     links = {frame.name for frame in full.frames if frame.type == pin.FrameType.BODY}
     for frame in full.frames[1:]:
         if frame.type == pin.FrameType.BODY or frame.name not in links:
-            parent, placement = placed[frame.parentJoint]
-            model.addFrame(
-                pin.Frame(
-                    frame.name, parent, 0, round_placement(placement * frame.placement), frame.type
-                )
-            )
-    return add_mimics(model, [coupled[j] for j in coupled], [placed[j][0] for j in coupled])
+            carrier, on_carrier = placed[frame.parentJoint]
+            frame_placement = round_placement(on_carrier * frame.placement)
+            model.addFrame(pin.Frame(frame.name, carrier, 0, frame_placement, frame.type))
+    mimics = [placed[j][0] for j in coupled]
+    return add_mimics(model, list(coupled.values()), mimics)
 
 
 def _make_geometry_object(
@@ -374,9 +383,8 @@ def _make_geometry_object(
 ) -> pin.GeometryObject:
     """Return `solid` as a geometry object on the joint of the URDF element's link."""
     frame = model.getFrameId(shape.link, pin.FrameType.BODY)
-    parent = model.frames[frame]
-    geometry_object = pin.GeometryObject(
-        name, parent.parentJoint, frame, round_placement(parent.placement * shape.placement), solid
-    )
+    link = model.frames[frame]
+    placement = round_placement(link.placement * shape.placement)
+    geometry_object = pin.GeometryObject(name, link.parentJoint, frame, placement, solid)
     geometry_object.meshColor = np.array(colour)
     return geometry_object

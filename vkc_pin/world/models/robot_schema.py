@@ -153,11 +153,9 @@ def read_wheels(
                 got=turning_radius,
             )
         return {"wheels": wheels}
-    radius = (
-        settings.base.turning_radius
-        if turning_radius is None
-        else check_coordinate(turning_radius, "turning_radius")
-    )
+    radius = settings.base.turning_radius
+    if turning_radius is not None:
+        radius = check_coordinate(turning_radius, "turning_radius")
     if radius is None:
         expected = "turning_radius [m] as an argument, or under `base` in robot.yaml"
         raise InputError(

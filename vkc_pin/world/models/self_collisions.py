@@ -11,12 +11,12 @@ import json
 import warnings
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.utils.disk_cache import load_or_build
 from vkc_pin.world.files.srdf import Srdf
 from vkc_pin.world.files.writing import write_atomically
@@ -36,7 +36,8 @@ _SAMPLES = 20_000
 _MAX_DISTANCE = 0.05
 # [m] equal to `Options.self_distance`: distance of links that a home must keep
 HOME_DISTANCE = 0.02
-_DESCENT_STARTS, _DESCENT_STEPS = 4, 200  # descents per pair of links, and steps of each
+_DESCENT_STARTS = 4  # descents per pair of links
+_DESCENT_STEPS = 200  # steps of each descent
 # [m] equal to the resolution of validation: links that never get further apart count as touching
 _CONTACT_DISTANCE = 1e-3
 # Fractions of the joint ranges in which a home is searched in turn, and samples in each
@@ -61,12 +62,14 @@ class SelfCollisionAnalysis(NamedTuple):
 
 def set_collision_pairs(robot: Robot, allowed: Collection[Pair]) -> Robot:
     """Return a copy of `robot` with all pairs in relative motion but those `allowed`."""
-    collision, shapes = pin.GeometryModel(), robot.collision.geometryObjects
+    shapes = robot.collision.geometryObjects
+    collision = pin.GeometryModel()
     for shape in shapes:
         collision.addGeometryObject(shape)
     for first, second in itertools.combinations(range(len(shapes)), 2):
         links = tuple(sorted((robot.link_of(first), robot.link_of(second))))
-        if shapes[first].parentJoint != shapes[second].parentJoint and links not in allowed:
+        in_relative_motion = shapes[first].parentJoint != shapes[second].parentJoint
+        if in_relative_motion and links not in allowed:
             collision.addCollisionPair(pin.CollisionPair(first, second))
     return dataclasses.replace(robot, collision=collision)
 
@@ -81,35 +84,32 @@ def apply_self_collision_analysis(
     """
     listed = None if semantics is None else semantics.allowed
     found = analyze_self_collisions(robot, listed, loose, samples=samples)
-    names = robot.coordinates.names[3:]
-    home, message = np.array(found.home), f"{robot.urdf}: "
-    if moved := [
-        f"{name}: {value:.3g}"
-        for name, value, was in zip(names, home, robot.home, strict=True)
-        if value != was
-    ]:
-        message += (
-            "links overlap at the default home; joints without a stated home position were moved"
+    home = np.array(found.home)
+    moved = list[str]()
+    for name, position, default in zip(robot.coordinates.names[3:], home, robot.home, strict=True):
+        if position != default:
+            moved.append(f"{name}: {position:.3g}")
+    if moved:
+        warnings.warn(
+            f"{robot.urdf}: links overlap at the default home; joints without a stated home "
+            f"position were moved: {', '.join(moved)}",
+            stacklevel=3,
         )
-        warnings.warn(f"{message}: {', '.join(moved)}", stacklevel=3)
-    warned_reasons = {
-        "Home": "overlap at home",
-        **({} if listed is None else {"Always": "always overlap or touch"}),
-    }
+    warned_reasons = {"Home": "overlap at home"}
+    if listed is not None:
+        warned_reasons["Always"] = "always overlap or touch"
     for reason, condition in warned_reasons.items():
-        links = [
-            " – ".join(pair)
-            for pair, why in found.allowed.items()
-            if why == reason and pair not in (listed or {})
-        ]
-        if links:
+        unlisted = list[str]()
+        for pair, pair_reason in found.allowed.items():
+            if pair_reason == reason and pair not in (listed or {}):
+                unlisted.append(" – ".join(pair))
+        if unlisted:
             warnings.warn(
-                f"{robot.urdf}: links that {condition} are not checked: {', '.join(links)}",
+                f"{robot.urdf}: links that {condition} are not checked: {', '.join(unlisted)}",
                 stacklevel=3,
             )
-    return set_collision_pairs(
-        dataclasses.replace(robot, home=home, tight=found.tight), found.allowed
-    )
+    analyzed = dataclasses.replace(robot, home=home, tight=found.tight)
+    return set_collision_pairs(analyzed, found.allowed)
 
 
 def analyze_self_collisions(
@@ -138,11 +138,15 @@ def analyze_self_collisions(
         robot.fingerprint,
     )
     key = json.dumps(inputs).encode()
-    allowed, tight, home = load_or_build(
-        key, lambda: _to_plain_lists(_compute_analysis(robot, listed, loose, samples))
-    )
+
+    def build() -> tuple[list[Any], list[Any], list[float]]:
+        return _to_plain_lists(_compute_analysis(robot, listed, loose, samples))
+
+    allowed, tight, home = load_or_build(key, build)
     return SelfCollisionAnalysis(
-        {(a, b): why for a, b, why in allowed}, {(a, b): gap for a, b, gap in tight}, tuple(home)
+        allowed={(one, other): reason for one, other, reason in allowed},
+        tight={(one, other): distance for one, other, distance in tight},
+        home=tuple(home),
     )
 
 
@@ -168,92 +172,114 @@ def sample_allowed_pairs(
     groups = {links: parts for links, parts in groups.items() if links not in adjacent}
     rng = np.random.default_rng(seed)
     distances = _make_shape_distances(robot)
-    low, high = _find_sampling_bounds(robot)
+    limits = _find_sampling_bounds(robot)
+    is_free, is_hit, closest = _sample_pairs(distances, groups, limits, rng, samples)
+    for number, (links, parts) in enumerate(groups.items()):
+        if not is_free[number]:
+            allowed[links] = "Always"
+        elif not is_hit[number]:
+            collides = any(
+                _descend_to_collision(distances, parts, np.array(z), limits, rng)
+                for _, z in closest[number]
+            )
+            if not collides:
+                allowed[links] = "Never"
+    neighbours = dict[Pair, Parts]()
+    for links in adjacent_bodies & groups.keys():
+        if allowed.get(links) != "Never":
+            neighbours[links] = groups[links]
+    for links, max_distance in _compute_max_distances(robot, neighbours, samples).items():
+        if max_distance < _MAX_DISTANCE:
+            allowed[links] = "Adjacent"
+    return dict(sorted(allowed.items()))
+
+
+class _Sampled(NamedTuple):
+    """Result of sampling: for each pair of links, whether it was apart, and whether it collided.
+
+    `closest` has the least distances [m] that are not above 50 mm, with their configurations.
+    """
+
+    is_free: Bools
+    is_hit: Bools
+    closest: list[list[tuple[float, tuple[float, ...]]]]
+
+
+def _sample_pairs(
+    distances: ShapeDistances,
+    groups: Mapping[Pair, Parts],
+    limits: tuple[Floats, Floats],
+    rng: np.random.Generator,
+    samples: int,
+) -> _Sampled:
+    """Sample pairs of links until each was found free and in collision, or samples end."""
+    low, high = limits
     link_distances = LinkDistances(distances, groups)
-    undecided = np.arange(len(groups))
-    free, hit = np.zeros((2, len(groups)), bool)
+    is_free = np.zeros(len(groups), bool)
+    is_hit = np.zeros(len(groups), bool)
     closest: list[list[tuple[float, tuple[float, ...]]]] = [[] for _ in groups]
+    undecided = np.arange(len(groups))
     for z in rng.uniform(low, high, (samples, len(low))):
         distances.set_configuration(z)
-        free[undecided[(bounds := link_distances.compute_lower_bounds()) > 0.0]] = True
-        for k in np.flatnonzero(bounds <= _MAX_DISTANCE).tolist():
-            best = closest[pair := undecided[k]]
-            distance = link_distances.compute_distance(
-                k,
-                min(_MAX_DISTANCE, best[-1][0]) if len(best) == _DESCENT_STARTS else _MAX_DISTANCE,
-            )
-            free[pair] |= distance > 0.0
-            hit[pair] |= distance <= 0.0
-            if (
-                distance < _MAX_DISTANCE
-                and not hit[pair]
-                and (len(best) < _DESCENT_STARTS or distance < best[-1][0])
-            ):
-                closest[pair] = sorted([*best, (distance, tuple(z))])[:_DESCENT_STARTS]
-        link_distances.select(left := ~(free & hit)[undecided])
-        undecided = undecided[left]
-    for pair, (links, parts) in enumerate(groups.items()):
-        if not free[pair]:
-            allowed[links] = "Always"
-        elif not hit[pair]:
-            starts = (np.array(z) for _, z in closest[pair])
-            if not any(
-                _descend_to_collision(distances, parts, z, (low, high), rng) for z in starts
-            ):
-                allowed[links] = "Never"
-    undecided_neighbours = {
-        links: groups[links]
-        for links in adjacent_bodies & groups.keys()
-        if allowed.get(links) != "Never"
-    }
-    allowed |= {
-        links: "Adjacent"
-        for links, max_distance in _compute_max_distances(
-            robot, undecided_neighbours, samples
-        ).items()
-        if max_distance < _MAX_DISTANCE
-    }
-    return dict(sorted(allowed.items()))
+        lower_bounds = link_distances.compute_lower_bounds()
+        is_apart = lower_bounds > 0.0
+        is_free[undecided[is_apart]] = True
+        for k in np.flatnonzero(lower_bounds <= _MAX_DISTANCE).tolist():
+            number = undecided[k]
+            best = closest[number]
+            is_full = len(best) == _DESCENT_STARTS
+            limit = min(_MAX_DISTANCE, best[-1][0]) if is_full else _MAX_DISTANCE
+            distance = link_distances.compute_distance(k, limit)
+            is_free[number] |= distance > 0.0
+            is_hit[number] |= distance <= 0.0
+            if distance < limit and not is_hit[number]:
+                closest[number] = sorted([*best, (distance, tuple(z))])[:_DESCENT_STARTS]
+        remains = ~(is_free & is_hit)[undecided]
+        link_distances.select(remains)
+        undecided = undecided[remains]
+    return _Sampled(is_free, is_hit, closest)
 
 
 def _compute_analysis(
     robot: Robot, listed: Mapping[Pair, str] | None, loose: Collection[str], samples: int
 ) -> SelfCollisionAnalysis:
     allowed = dict(sample_allowed_pairs(robot, samples=samples) if listed is None else listed)
-    groups = {
-        links: parts for links, parts in _group_shape_pairs(robot).items() if links not in allowed
-    }
-    max_distances = {
-        links: max_distance
-        for links, max_distance in _compute_max_distances(robot, groups, samples).items()
-        if max_distance < _MAX_DISTANCE
-    }
+    groups = _omit_pairs(_group_shape_pairs(robot), allowed)
+    max_distances = dict[Pair, float]()
+    for links, max_distance in _compute_max_distances(robot, groups, samples).items():
+        if max_distance < _MAX_DISTANCE:
+            max_distances[links] = max_distance
     adjacent = frozenset().union(*find_neighbours(robot.file, robot.links))
     for links, max_distance in max_distances.items():
-        if links in adjacent or max_distance <= _CONTACT_DISTANCE:
-            allowed[links] = "Adjacent" if links in adjacent else "Always"
-    groups = {links: parts for links, parts in groups.items() if links not in allowed}
-    tight = {
-        links: max_distance for links, max_distance in max_distances.items() if links in groups
-    }
+        if links in adjacent:
+            allowed[links] = "Adjacent"
+        elif max_distance <= _CONTACT_DISTANCE:
+            allowed[links] = "Always"
+    groups = _omit_pairs(groups, allowed)
+    tight = {links: distance for links, distance in max_distances.items() if links in groups}
     robot = dataclasses.replace(robot, tight=tight)
     home = _find_free_home(robot, groups, loose)
     distances = _make_shape_distances(robot)
     distances.set_configuration(np.array([0.0, 0.0, 0.0, *home]))
     for links, parts in groups.items():
-        if (gap := distances.compute_distance(parts, _MAX_DISTANCE)) <= 0.0:
+        distance = distances.compute_distance(parts, _MAX_DISTANCE)
+        if distance <= 0.0:
             allowed[links] = "Home"
             tight.pop(links, None)
-        elif gap < _MAX_DISTANCE:
-            tight[links] = min(gap, tight.get(links, np.inf))
+        elif distance < _MAX_DISTANCE:
+            tight[links] = min(distance, tight.get(links, np.inf))
     return SelfCollisionAnalysis(dict(sorted(allowed.items())), dict(sorted(tight.items())), home)
 
 
-def _to_plain_lists(
-    found: SelfCollisionAnalysis,
-) -> tuple[list[tuple[str, str, str]], list[tuple[str, str, float]], list[float]]:
+def _omit_pairs(groups: Mapping[Pair, Parts], allowed: Collection[Pair]) -> dict[Pair, Parts]:
+    return {links: parts for links, parts in groups.items() if links not in allowed}
+
+
+def _to_plain_lists(found: SelfCollisionAnalysis) -> tuple[list[Any], list[Any], list[float]]:
+    """Return an analysis as lists that JSON has: (link, link, reason), (link, link, distance)."""
     allowed = [(*links, reason) for links, reason in found.allowed.items()]
-    return allowed, [(*links, gap) for links, gap in found.tight.items()], list(found.home)
+    tight = [(*links, distance) for links, distance in found.tight.items()]
+    return allowed, tight, list(found.home)
 
 
 def _find_free_home(
@@ -261,56 +287,78 @@ def _find_free_home(
 ) -> tuple[float, ...]:
     """Return the robot's home, or one with fewer overlaps that differs in `loose` joints only."""
     distances = _make_shape_distances(robot)
-    low, high = _find_sampling_bounds(robot)
+    limits = _find_sampling_bounds(robot)
     rng = np.random.default_rng(0)
     is_loose = np.array([name in loose for name in robot.coordinates.names])
     default_home = np.array([0.0, 0.0, 0.0, *robot.home])
 
-    def count_violations(z: Floats, margin: float, limit: float) -> int:
+    def count_violations(z: Floats, limit: int) -> int:
         """Return the number of pairs below their margin; counting stops above `limit`."""
         distances.set_configuration(z)
         count = 0
         for links, parts in groups.items():
-            least = robot.own_margin(links, margin)
-            count += (
-                distances.compute_distance(parts, least) < least
-                if margin
-                else distances.compute_distance(parts, 0.0) <= 0.0
-            )
+            margin = robot.own_margin(links, HOME_DISTANCE)
+            if distances.compute_distance(parts, margin) < margin:
+                count += 1
             if count > limit:
                 break
         return count
 
-    best, fewest = default_home, count_violations(default_home, 0.0, np.inf)
-    if not fewest or not is_loose.any():
+    distances.set_configuration(default_home)
+    overlaps = [parts for parts in groups.values() if distances.compute_distance(parts, 0.0) <= 0.0]
+    best = default_home
+    fewest = len(overlaps)
+    if fewest == 0 or not is_loose.any():
         return tuple(best[3:].tolist())
     for radius in _HOME_SEARCH_RADII:
-        candidates = default_home + np.where(
-            is_loose,
-            radius
-            * (rng.uniform(low, high, (_HOME_SEARCH_SAMPLES, len(default_home))) - default_home),
-            0.0,
-        )
-        for z in candidates[
-            np.argsort(
-                (np.abs(candidates - default_home) / np.maximum(high - low, 1e-9)).max(axis=1),
-                kind="stable",
-            )
-        ]:
-            if (count := count_violations(z, HOME_DISTANCE, fewest - 1)) < fewest:
-                best, fewest = z, count
-            if not fewest:
+        candidates = _sample_around(default_home, is_loose, radius, limits, rng)
+        for z in candidates:
+            count = count_violations(z, fewest - 1)
+            if count < fewest:
+                best = z
+                fewest = count
+            if fewest == 0:
                 return tuple(best[3:].tolist())
     return tuple(best[3:].tolist())
 
 
+def _sample_around(
+    center: Floats,
+    is_loose: Bools,
+    radius: float,
+    limits: tuple[Floats, Floats],
+    rng: np.random.Generator,
+) -> Floats:
+    """Return random configurations around one, the nearest first, shape (samples, n).
+
+    Nearest is the one with the least largest step of a joint, relative to the joint's range.
+
+    Args:
+        center: Configuration, shape (n,) [m], [rad].
+        is_loose: Whether each coordinate may change, shape (n,).
+        radius: Largest step, relative to the distance from `center` to the limits.
+        limits: Lower and upper limits, shape (n,) each [m], [rad].
+        rng: Random numbers.
+    """
+    low, high = limits
+    samples = rng.uniform(low, high, (_HOME_SEARCH_SAMPLES, len(center)))
+    steps = np.where(is_loose, radius * (samples - center), 0.0)
+    candidates = center + steps
+    ranges = np.maximum(high - low, 1e-9)
+    relative_steps = (np.abs(candidates - center) / ranges).max(axis=1)
+    order = np.argsort(relative_steps, kind="stable")
+    return np.asarray(candidates[order])
+
+
 def _group_shape_pairs(robot: Robot) -> dict[Pair, Parts]:
     """Return sorted pairs of links in relative motion → pairs of their shapes."""
-    shapes, groups = robot.collision.geometryObjects, dict[Pair, Parts]()
+    shapes = robot.collision.geometryObjects
+    groups = dict[Pair, Parts]()
     for first, second in itertools.combinations(range(len(shapes)), 2):
         if shapes[first].parentJoint != shapes[second].parentJoint:
             one, other = sorted((robot.link_of(first), robot.link_of(second)))
-            groups.setdefault((one, other), []).append((first, second))
+            parts = groups.setdefault((one, other), [])
+            parts.append((first, second))
     return groups
 
 
@@ -321,23 +369,23 @@ def _compute_max_distances(
     distances = _make_shape_distances(robot)
     low, high = _find_sampling_bounds(robot)
     rng = np.random.default_rng(0)
-    link_distances, max_distances = LinkDistances(distances, groups), dict.fromkeys(groups, -np.inf)
-    for z in (np.array([0.0, 0.0, 0.0, *robot.home]), *rng.uniform(low, high, (samples, len(low)))):
+    home = np.array([0.0, 0.0, 0.0, *robot.home])
+    configurations = (home, *rng.uniform(low, high, (samples, len(low))))
+    link_distances = LinkDistances(distances, groups)
+    max_distances = dict.fromkeys(groups, -np.inf)
+    for z in configurations:
         if not link_distances.links:
             break
         distances.set_configuration(z)
-        for k, (links, bound) in enumerate(
-            zip(link_distances.links, link_distances.compute_lower_bounds(), strict=True)
-        ):
-            max_distances[links] = max(
-                max_distances[links],
-                float(bound)
-                if bound > _MAX_DISTANCE
-                else link_distances.compute_distance(k, _MAX_DISTANCE),
-            )
-        link_distances.select(
-            [max_distances[links] < _MAX_DISTANCE for links in link_distances.links]
-        )
+        lower_bounds = link_distances.compute_lower_bounds()
+        for k, links in enumerate(link_distances.links):
+            distance = float(lower_bounds[k])
+            if distance <= _MAX_DISTANCE:
+                distance = link_distances.compute_distance(k, _MAX_DISTANCE)
+            max_distances[links] = max(max_distances[links], distance)
+        # Pairs that were far apart once need no more samples.
+        remains = [max_distances[links] < _MAX_DISTANCE for links in link_distances.links]
+        link_distances.select(remains)
     return max_distances
 
 
@@ -345,7 +393,8 @@ def _find_sampling_bounds(robot: Robot) -> tuple[Floats, Floats]:
     """Return lower and upper bounds of sampled configurations, shape (n,) each [m], [rad]."""
     low = np.where(np.isfinite(robot.lower), robot.lower, -np.pi)
     high = np.where(np.isfinite(robot.upper), robot.upper, np.pi)
-    low[:3] = high[:3] = 0.0
+    low[:3] = 0.0
+    high[:3] = 0.0
     return low, high
 
 
@@ -365,27 +414,27 @@ def write_srdf(robot: Robot, path: str | Path, *, samples: int = _SAMPLES, seed:
     Returns:
         Path of the file.
     """
+    joints = robot.coordinates.names[3:]
     lines = [
         '<?xml version="1.0"?>',
         f"<!-- Written by `vkc-pin srdf`: {samples} samples, seed {seed}. Adjacent: connected by",
         "     a joint. Always: in collision in all samples. Never: in collision in no sample, nor",
         "     after descents of the distance from the closest samples. -->",
         f"<robot name={quote(robot.name)}>",
-        '  <group name="arm">',
-        *(f"    <joint name={quote(name)}/>" for name in robot.coordinates.names[3:]),
-        "  </group>",
-        '  <group_state name="home" group="arm">',
-        *(
-            f"    <joint name={quote(name)} value={quote(f'{value:.12g}')}/>"
-            for name, value in zip(robot.coordinates.names[3:], robot.home, strict=True)
-        ),
-        "  </group_state>",
-        *(
-            f"  <disable_collisions link1={quote(a)} link2={quote(b)} reason={quote(reason)}/>"
-            for (a, b), reason in sample_allowed_pairs(robot, samples=samples, seed=seed).items()
-        ),
-        "</robot>",
     ]
+    lines.append('  <group name="arm">')
+    for name in joints:
+        lines.append(f"    <joint name={quote(name)}/>")
+    lines.append("  </group>")
+    lines.append('  <group_state name="home" group="arm">')
+    for name, position in zip(joints, robot.home, strict=True):
+        lines.append(f"    <joint name={quote(name)} value={quote(f'{position:.12g}')}/>")
+    lines.append("  </group_state>")
+    allowed = sample_allowed_pairs(robot, samples=samples, seed=seed)
+    for (one, other), reason in allowed.items():
+        links = f"link1={quote(one)} link2={quote(other)}"
+        lines.append(f"  <disable_collisions {links} reason={quote(reason)}/>")
+    lines.append("</robot>")
     return write_atomically(path, ("\n".join(lines) + "\n").encode())
 
 
@@ -401,11 +450,13 @@ def _descend_to_collision(
     distances.set_configuration(z)
     nearest = distances.compute_distance(parts)
     for width in np.geomspace(0.2, 0.002, _DESCENT_STEPS):
-        trial = np.clip(z + width * (high - low) / 6.0 * rng.standard_normal(len(z)), low, high)
+        step = width * (high - low) / 6.0 * rng.standard_normal(len(z))
+        trial = np.clip(z + step, low, high)
         distances.set_configuration(trial)
         distance = distances.compute_distance(parts)
         if distance < nearest:
-            z, nearest = trial, distance
+            z = trial
+            nearest = distance
         if nearest <= 0.0:
             return True
     return False

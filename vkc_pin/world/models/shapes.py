@@ -91,22 +91,35 @@ def compute_clearance(
         second: Other shapes, likewise.
         reach: Cutoff [m]: if all distances are larger, the result is some number ≥ `reach`.
     """
-    nearest, some, others = reach, list(first), list(second)
-    boxes = [
-        np.array([compute_world_box(*shape) for shape in group]).reshape(-1, 2, 3)
-        for group in (some, others)
-    ]
-    (low, high), (lower, upper) = (each.swapaxes(0, 1) for each in boxes)
-    # Shapes translated by the overlap of their boxes are separate, so that negative gaps are lower
-    # bounds, too.
-    gaps = np.maximum(lower - high[:, None], low[:, None] - upper).max(axis=2)
-    pairs = np.argwhere(gaps < reach)
-    pairs = pairs[np.argsort(gaps[tuple(pairs.T)], kind="stable")]
-    for i, k in pairs.tolist():
-        if gaps[i, k] >= nearest:
+    first_shapes = list(first)
+    second_shapes = list(second)
+    first_lower, first_upper = _compute_world_boxes(first_shapes)
+    second_lower, second_upper = _compute_world_boxes(second_shapes)
+    # Gaps between the boxes along the axes, shape (first, second, 3). The largest is a lower bound
+    # of the distance even if it is negative, since a translation by that amount separates the
+    # shapes.
+    gaps = np.maximum(second_lower - first_upper[:, None], first_lower[:, None] - second_upper)
+    bounds = gaps.max(axis=2)
+    pairs = np.argwhere(bounds < reach)
+    order = np.argsort(bounds[tuple(pairs.T)], kind="stable")
+    nearest = reach
+    for i, k in pairs[order].tolist():
+        if bounds[i, k] >= nearest:
             break
-        nearest = min(nearest, compute_shape_distance(*some[i], *others[k]))
+        distance = compute_shape_distance(*first_shapes[i], *second_shapes[k])
+        nearest = min(nearest, distance)
     return nearest
+
+
+def _compute_world_boxes(
+    shapes: Sequence[tuple[coal.CollisionGeometry, pin.SE3]],
+) -> tuple[Floats, Floats]:
+    """Return the corners of the shapes' axis-aligned boxes, shape (n, 3) each [m]."""
+    corners = np.empty((2, len(shapes), 3))
+    for k, (shape, placement) in enumerate(shapes):
+        corners[:, k] = compute_world_box(shape, placement)
+    lower, upper = corners
+    return lower, upper
 
 
 def compute_shape_distance(
@@ -116,8 +129,11 @@ def compute_shape_distance(
     second_placement: pin.SE3,
 ) -> float:
     """Return the signed distance between two shapes at placements in a common frame [m]."""
-    where, there = flatten_placements([first_placement, second_placement])
-    return compute_distance(convert_solid(first), where, convert_solid(second), there)[0]
+    first_row, second_row = flatten_placements([first_placement, second_placement])
+    distance, _ = compute_distance(
+        convert_solid(first), first_row, convert_solid(second), second_row
+    )
+    return distance
 
 
 def triangulate(shape: coal.CollisionGeometry) -> tuple[Floats, NDArray[np.int64]]:
@@ -155,7 +171,8 @@ def triangulate(shape: coal.CollisionGeometry) -> tuple[Floats, NDArray[np.int64
         mesh = make.capsule(
             height=length, radius=shape.radius, count=(_CIRCLE_SEGMENTS, _CIRCLE_SEGMENTS)
         )
-        mesh.apply_translation([0.0, 0.0, -(mesh.bounds[0, 2] + mesh.bounds[1, 2]) / 2.0])
+        lower, upper = mesh.bounds
+        mesh.apply_translation([0.0, 0.0, -(lower[2] + upper[2]) / 2.0])
     else:
         raise InputError(
             "this shape cannot be drawn", expected="a solid or a mesh", got=type(shape).__name__
@@ -165,16 +182,19 @@ def triangulate(shape: coal.CollisionGeometry) -> tuple[Floats, NDArray[np.int64
 
 def compute_bounding_box(shape: pin.GeometryObject) -> tuple[Floats, Floats]:
     """Return centre and half extents of a shape's bounding box in its own frame, (3,) each [m]."""
-    shape.geometry.computeLocalAABB()
-    return np.asarray(shape.geometry.aabb_local.center(), float), _get_half_extents(shape.geometry)
+    geometry = shape.geometry
+    geometry.computeLocalAABB()
+    center = np.asarray(geometry.aabb_local.center(), float)
+    return center, _get_half_extents(geometry)
 
 
 def compute_world_box(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[Floats, Floats]:
     """Return the corners of a shape's axis-aligned box in the world frame, shape (3,) each [m]."""
     shape.computeLocalAABB()
-    centre = placement.act(np.asarray(shape.aabb_local.center(), float))
+    center = placement.act(np.asarray(shape.aabb_local.center(), float))
+    # A box with the half extents h and the rotation R reaches |R| h along the axes of the world.
     extent = np.abs(placement.rotation) @ _get_half_extents(shape)
-    return centre - extent, centre + extent
+    return center - extent, center + extent
 
 
 class ShapeDistances:
@@ -192,44 +212,53 @@ class ShapeDistances:
         configuration: Callable[[Floats], Floats],
         shapes: Sequence[pin.GeometryObject],
     ) -> None:
-        self._model, self._configuration, self._data = model, configuration, model.createData()
-        geometries = [shape.geometry for shape in shapes]
-        self._solids = [convert_solid(geometry) for geometry in geometries]
+        self._model = model
+        self._configuration = configuration
+        self._data = model.createData()
+        self._solids = [convert_solid(shape.geometry) for shape in shapes]
+        # Placements of the shapes, and bounding spheres and boxes, in the frames of their joints.
         self._joints = np.array([shape.parentJoint for shape in shapes])
-        self._locals = [shape.placement for shape in shapes]
-        for geometry in geometries:
-            geometry.computeLocalAABB()
-        self._radii = np.array([geometry.aabb_radius for geometry in geometries])
-        self._middles = np.array(
-            [
-                place.act(geometry.aabb_center)
-                for place, geometry in zip(self._locals, geometries, strict=True)
-            ]
-        )
-        self._turns = np.array([place.rotation for place in self._locals])
-        self._halves = np.array([_get_half_extents(geometry) for geometry in geometries])
+        self._placements = [shape.placement for shape in shapes]
+        self._rotations = np.array([placement.rotation for placement in self._placements])
+        centers = list[Floats]()
+        radii = list[float]()
+        half_extents = list[Floats]()
+        for shape in shapes:
+            shape.geometry.computeLocalAABB()
+            centers.append(shape.placement.act(shape.geometry.aabb_center))
+            radii.append(shape.geometry.aabb_radius)
+            half_extents.append(_get_half_extents(shape.geometry))
+        self._centers_in_joints = np.array(centers)
+        self._radii = np.array(radii)
+        self._half_extents = np.array(half_extents)
 
     def set_configuration(self, z: Floats) -> None:
         """Set the model to the minimal coordinates `z`, shape (n,)."""
         pin.forwardKinematics(self._model, self._data, self._configuration(z))
-        rotations = np.array([place.rotation for place in self._data.oMi])[self._joints]
-        positions = np.array([place.translation for place in self._data.oMi])[self._joints]
-        self._centres = np.einsum("kij,kj->ki", rotations, self._middles) + positions
+        joint_placements = self._data.oMi
+        rotations = np.array([placement.rotation for placement in joint_placements])[self._joints]
+        positions = np.array([placement.translation for placement in joint_placements])[
+            self._joints
+        ]
+        self._centers = np.einsum("kij,kj->ki", rotations, self._centers_in_joints) + positions
+        # The last row of a rotation is the vertical of the world in the frame of the joint.
         self._verticals = rotations[:, 2]
-        self._places: dict[int, Floats] = {}
+        self._placement_rows: dict[int, Floats] = {}
 
     def compute_lowest_points(self) -> Floats:
         """Return the lowest height of each shape's bounding box, shape (shapes,) [m]."""
-        across = np.abs(np.einsum("kj,kji->ki", self._verticals, self._turns))
-        return np.asarray(self._centres[:, 2] - np.einsum("ki,ki->k", across, self._halves))
+        verticals_in_shapes = np.einsum("kj,kji->ki", self._verticals, self._rotations)
+        # A box with the half extents h reaches |v| · h below its centre along the unit vector v.
+        depths = np.einsum("ki,ki->k", np.abs(verticals_in_shapes), self._half_extents)
+        return np.asarray(self._centers[:, 2] - depths)
 
     def compute_lower_bounds(self, pairs: Ints) -> Floats:
         """Return lower bounds [m], shape (P,), of the distances of `pairs`, by bounding spheres."""
-        first, second = pairs[:, 0], pairs[:, 1]
-        gaps = self._centres[first] - self._centres[second]
-        return np.asarray(
-            np.sqrt(np.einsum("ki,ki->k", gaps, gaps)) - self._radii[first] - self._radii[second]
-        )
+        first = pairs[:, 0]
+        second = pairs[:, 1]
+        offsets = self._centers[first] - self._centers[second]
+        center_distances = np.sqrt(np.einsum("ki,ki->k", offsets, offsets))
+        return np.asarray(center_distances - self._radii[first] - self._radii[second])
 
     def compute_distance(self, parts: Iterable[tuple[int, int]], cutoff: float = np.inf) -> float:
         """Return the smallest distance of pairs of shapes [m].
@@ -238,22 +267,25 @@ class ShapeDistances:
         """
         smallest = np.inf
         for first, second in parts:
-            gap = self._centres[first] - self._centres[second]
-            bound = float(np.sqrt(gap @ gap) - self._radii[first] - self._radii[second])
+            offset = self._centers[first] - self._centers[second]
+            bound = float(np.sqrt(offset @ offset) - self._radii[first] - self._radii[second])
             if bound <= min(smallest, cutoff):
-                one, other = (
-                    (self._solids[shape], self._compute_placement(shape))
-                    for shape in (first, second)
+                bound, _ = compute_distance(
+                    self._solids[first],
+                    self._compute_placement_row(first),
+                    self._solids[second],
+                    self._compute_placement_row(second),
                 )
-                bound, _ = compute_distance(*one, *other)
             smallest = min(smallest, bound)
         return smallest
 
-    def _compute_placement(self, shape: int) -> Floats:
-        if shape not in self._places:
-            place = self._data.oMi[int(self._joints[shape])] * self._locals[shape]
-            self._places[shape] = flatten_placements([place])[0]
-        return self._places[shape]
+    def _compute_placement_row(self, shape: int) -> Floats:
+        """Return the placement of a shape in the world frame; see `flatten_placements`."""
+        if shape not in self._placement_rows:
+            joint = int(self._joints[shape])
+            placement = self._data.oMi[joint] * self._placements[shape]
+            self._placement_rows[shape] = flatten_placements([placement])[0]
+        return self._placement_rows[shape]
 
 
 class LinkDistances:
@@ -277,13 +309,14 @@ class LinkDistances:
 
     def select(self, chosen: Sequence[bool] | Bools) -> None:
         """Keep only the `chosen` pairs of links, shape (links,)."""
-        if not all(chosen):
-            self._groups = {
-                links: parts
-                for (links, parts), keep in zip(self._groups.items(), chosen, strict=True)
-                if keep
-            }
-            self._concatenate_pairs()
+        if all(chosen):
+            return
+        groups = {}
+        for (links, parts), is_chosen in zip(self._groups.items(), chosen, strict=True):
+            if is_chosen:
+                groups[links] = parts
+        self._groups = groups
+        self._concatenate_pairs()
 
     def compute_lower_bounds(self) -> Floats:
         """Return lower bounds of all distances at the current configuration, shape (links,) [m]."""
@@ -297,15 +330,17 @@ class LinkDistances:
 
         Uses the bounds of the last call of `compute_lower_bounds`.
         """
-        start, end = self._starts[number], self._ends[number]
-        close = self._pairs[start:end][self._bounds[start:end] <= cutoff]
-        return self._distances.compute_distance(map(tuple, close.tolist()), cutoff)
+        own = slice(self._starts[number], self._ends[number])
+        is_close = self._bounds[own] <= cutoff
+        close_pairs = self._pairs[own][is_close]
+        return self._distances.compute_distance(map(tuple, close_pairs.tolist()), cutoff)
 
     def _concatenate_pairs(self) -> None:
         self.links = list(self._groups)
         counts = np.array([len(parts) for parts in self._groups.values()], np.int64)
         self._ends = np.cumsum(counts)
         self._starts = self._ends - counts
+        # The empty array gives the shape if there are no pairs.
         self._pairs = np.vstack([np.zeros((0, 2), np.int64), *self._groups.values()])
 
 

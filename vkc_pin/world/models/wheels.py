@@ -21,8 +21,9 @@ _UPRIGHT = 0.9  # smallest vertical part of a steering axis
 _PARALLEL = 0.98  # smallest cosine between the axes of wheels that roll in one direction
 # Distance [m] of the root from the axle, and angle [rad] of its x axis from the rolling direction,
 # below which wheels slide by less than 10 mm/s at 2 rad/s and 1 m/s.
-_AXLE_DISTANCE, _AXLE_ANGLE = 0.005, 0.01
-_COUNT = 4  # of a base with skid steer or mecanum wheels
+_AXLE_DISTANCE = 0.005
+_AXLE_ANGLE = 0.01
+_SKID_STEER_WHEELS = 4  # number of wheels of a base with skid steer or mecanum wheels
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,44 +86,70 @@ def find_drive(full: pin.Model, file: UrdfFile, carrying: Collection[str] = ()) 
         return Drive("omni", "names of wheels", _get_names(wheels), np.zeros(2))
     if not wheels:
         return None
-    fixed = [wheel for wheel in wheels if wheel.steering is None]
-    fixed = [wheel for wheel in fixed if not wheel.is_caster] or fixed
-    if not fixed:
+    unsteered = [wheel for wheel in wheels if wheel.steering is None]
+    unsteered = [wheel for wheel in unsteered if not wheel.is_caster] or unsteered
+    if not unsteered:
         return Drive("omni", "all wheels are steered", _get_names(wheels), np.zeros(2))
-    axes = np.array([wheel.axis[:2] / np.linalg.norm(wheel.axis[:2]) for wheel in fixed])
-    if np.abs(axes @ axes.T).min() < _PARALLEL:
+    axes = np.array([wheel.axis[:2] / np.linalg.norm(wheel.axis[:2]) for wheel in unsteered])
+    cosines = np.abs(axes @ axes.T)
+    if cosines.min() < _PARALLEL:
         why = "wheels that roll in different directions"
         return Drive("omni", why, _get_names(wheels), np.zeros(2))
-    # A wheel with the axis y rolls along x; axes of left and right wheels may be mirrored.
-    axle = (axes * np.sign(axes @ axes[0])[:, None]).mean(axis=0)
-    axle /= np.linalg.norm(axle)
-    forward = np.array([axle[1], -axle[0]])
-    if forward @ [1.0, 1e-3] < 0.0:  # towards x; or y, if it is across x
-        forward = -forward
-    across = np.array([-forward[1], forward[0]])
-    positions = np.array([wheel.position[:2] for wheel in fixed])
+    forward = _find_rolling_direction(axes)
+    positions = np.array([wheel.position[:2] for wheel in unsteered])
     center = (positions.mean(axis=0) @ forward) * forward
-    kind, radius = "differential", None
-    why = f"{len(fixed)} wheel{'s' * (len(fixed) != 1)}"
-    steered = [
-        wheel
-        for wheel in wheels
-        if wheel.steering is not None
-        and not wheel.is_caster
-        and 0.0 < _find_travel(full, wheel.steering) < np.inf
-    ]
+    steered = list[_Wheel]()
+    for wheel in wheels:
+        if wheel.steering is not None and not wheel.is_caster:
+            travel = _find_travel(full, wheel.steering)
+            if 0.0 < travel < np.inf:
+                steered.append(wheel)
+    kind = "differential"
+    why = "1 wheel" if len(unsteered) == 1 else f"{len(unsteered)} wheels"
+    radius = None
     if steered:
         kind = "ackermann"
         why += f" and {len(steered)} steered ones"
-        base = min(abs((wheel.position[:2] - center) @ forward) for wheel in steered)
         angle = min(_find_travel(full, str(wheel.steering)) for wheel in steered)
-        half_track = max(abs(wheel.position[:2] @ across) for wheel in steered)
-        # The inner wheel turns by `angle` about a point on the axle: radius - half_track from it.
-        radius = float(base / np.tan(min(angle, 0.5 * np.pi)) + half_track)
-    elif len(fixed) >= _COUNT:
+        radius = _compute_turning_radius(steered, center, forward, angle)
+    elif len(unsteered) >= _SKID_STEER_WHEELS:
         why += ", as for skid steer; mecanum wheels would be `omni`"
     yaw = float(np.arctan2(forward[1], forward[0]))
-    return Drive(kind, why, _get_names(fixed), center, yaw, radius)
+    return Drive(kind, why, _get_names(unsteered), center, yaw, radius)
+
+
+def _find_rolling_direction(axes: Floats) -> Floats:
+    """Return the unit vector in which wheels with nearly parallel `axes`, shape (n, 2), roll."""
+    # Axes of left and right wheels may be mirrored.
+    signs = np.sign(axes @ axes[0])
+    axle = (axes * signs[:, None]).mean(axis=0)
+    axle /= np.linalg.norm(axle)
+    # A wheel with the axis y rolls along x.
+    forward = np.array([axle[1], -axle[0]])
+    # Of the two directions, that towards x; or y, if it is across x.
+    if forward @ [1.0, 1e-3] < 0.0:
+        forward = -forward
+    return forward
+
+
+def _compute_turning_radius(
+    steered: list[_Wheel], center: Floats, forward: Floats, angle: float
+) -> float:
+    """Return the least turning radius of the middle of the axle [m].
+
+    The base turns about a point on the axle at the radius r. The axis of a wheel at the distance l
+    ahead of the axle, and h to the inner side, passes through it if tan(angle) = l / (r − h).
+
+    Args:
+        steered: The steered wheels.
+        center: Middle of the axle, shape (2,) [m].
+        forward: Rolling direction, shape (2,).
+        angle: Largest steering angle [rad].
+    """
+    across = np.array([-forward[1], forward[0]])
+    length = min(abs((wheel.position[:2] - center) @ forward) for wheel in steered)
+    half_track = max(abs(wheel.position[:2] @ across) for wheel in steered)
+    return float(length / np.tan(min(angle, 0.5 * np.pi)) + half_track)
 
 
 def is_on_axle(drive: Drive) -> bool:
@@ -140,23 +167,24 @@ def describe_misplaced_axle(drive: Drive) -> str:
     if distance > _AXLE_DISTANCE:
         x, y = np.round(drive.center, 3) + 0.0  # without negative zeros
         if abs(drive.yaw) <= _AXLE_ANGLE:
-            parts.append(f"{distance:.3f} m {'ahead of' if x > 0.0 else 'behind'} the root link")
+            side = "ahead of" if x > 0.0 else "behind"
+            parts.append(f"{distance:.3f} m {side} the root link")
         else:
             parts.append(f"{distance:.3f} m from the root link, at x {x:.3f}, y {y:.3f}")
     if abs(drive.yaw) > _AXLE_ANGLE:
         parts.append(f"rolls at {np.degrees(drive.yaw):.0f}° from its x axis")
-    middle = "the axle" if len(drive.wheels) < _COUNT else "the middle"
+    middle = "the axle" if len(drive.wheels) < _SKID_STEER_WHEELS else "the middle"
     return f"{middle} of {', '.join(drive.wheels)} is {' and '.join(parts)}"
 
 
 def _find_wheels(full: pin.Model, file: UrdfFile, carrying: Collection[str]) -> list[_Wheel]:
     data = full.createData()
     pin.forwardKinematics(full, data, pin.neutral(full))
-    children = {
-        joint.get("name", ""): child.get("link", "")
-        for joint in file.root.findall("joint")
-        if (child := joint.find("child")) is not None
-    }
+    children = dict[str, str]()  # joint → child link
+    for element in file.root.findall("joint"):
+        child = element.find("child")
+        if child is not None:
+            children[element.get("name", "")] = child.get("link", "")
     wheels = list[_Wheel]()
     for element in file.root.findall("joint"):
         name = element.get("name", "")
@@ -164,29 +192,33 @@ def _find_wheels(full: pin.Model, file: UrdfFile, carrying: Collection[str]) -> 
             continue
         number = full.getJointId(name)
         axis = _find_axis(full, data, number)
-        if np.isfinite(_find_travel(full, name)) or not axis.any() or abs(axis[2]) > _LEVEL:
+        has_limits = np.isfinite(_find_travel(full, name))
+        if has_limits or not axis.any() or abs(axis[2]) > _LEVEL:
             continue
-        above = [
-            joint
-            for joint in list(full.supports[number])[2:-1]
-            if str(full.names[joint]) not in carrying
-        ]
-        steering = [
-            str(full.names[joint])
-            for joint in above
-            if abs(_find_axis(full, data, joint)[2]) > _UPRIGHT
-        ]
-        words = set(split_words(f"{name} {children.get(name, '')}"))
-        for joint in steering:
-            words.update(split_words(f"{joint} {children.get(joint, '')}"))
-        position = np.array(data.oMi[number].translation)
-        last = steering[-1] if steering else None
-        wheels.append(_Wheel(name, position, axis, last, not _CASTER_WORDS.isdisjoint(words)))
+        steering_joints = list[str]()
+        # The joints between the base and the wheel.
+        for joint in list(full.supports[number])[2:-1]:
+            joint_name = str(full.names[joint])
+            is_upright = abs(_find_axis(full, data, joint)[2]) > _UPRIGHT
+            if joint_name not in carrying and is_upright:
+                steering_joints.append(joint_name)
+        words = set[str]()
+        for joint_name in (name, *steering_joints):
+            words.update(split_words(f"{joint_name} {children.get(joint_name, '')}"))
+        wheel = _Wheel(
+            joint=name,
+            position=np.array(data.oMi[number].translation),
+            axis=axis,
+            steering=steering_joints[-1] if steering_joints else None,
+            is_caster=not _CASTER_WORDS.isdisjoint(words),
+        )
+        wheels.append(wheel)
     return wheels
 
 
 def _find_axis(full: pin.Model, data: pin.Data, number: int) -> Floats:
     """Return the axis about which a joint turns, shape (3,); zero if it does not."""
+    # The motion subspace S has the linear velocity, then the angular one.
     motion = np.asarray(data.joints[number].S, float)
     if motion.size != 6:
         return np.zeros(3)
@@ -194,7 +226,7 @@ def _find_axis(full: pin.Model, data: pin.Data, number: int) -> Floats:
 
 
 def _find_travel(full: pin.Model, name: str) -> float:
-    """Return how far a joint turns to its nearer limit [rad]; infinite beyond half a turn."""
+    """Return the angle from 0 to a joint's nearer limit [rad]; infinite beyond half a turn."""
     moving = full.joints[full.getJointId(name)]
     if moving.nq != 1:
         return np.inf

@@ -93,12 +93,11 @@ class ClosePair(NamedTuple):
     distance: float
 
     def __str__(self) -> str:
-        apart = (
-            f"are {1e3 * self.distance:.1f} mm apart"
-            if self.distance >= 0.0
-            else f"overlap by {-1e3 * self.distance:.1f} mm"
-        )
-        return f"{self.first} – {self.second} {apart}"
+        if self.distance >= 0.0:
+            relation = f"are {1e3 * self.distance:.1f} mm apart"
+        else:
+            relation = f"overlap by {-1e3 * self.distance:.1f} mm"
+        return f"{self.first} – {self.second} {relation}"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -136,12 +135,15 @@ class ClearanceExemption:
             labels: Label of each shape.
             keys: Key of each shape, see `make_shape_keys`.
         """
-        wanted = (None, None) if self.shapes is None else self.shapes
-        ones, others = (
-            [k for k, name in enumerate(labels) if name == label and key in (None, keys[k])]
-            for label, key in zip((self.first, self.second), wanted, strict=True)
-        )
-        return [(min(i, j), max(i, j)) for i in ones for j in others]
+        first_key, second_key = (None, None) if self.shapes is None else self.shapes
+
+        def find_shapes(label: str, key: str | None) -> list[int]:
+            own = [k for k, name in enumerate(labels) if name == label]
+            return [k for k in own if key is None or keys[k] == key]
+
+        first_shapes = find_shapes(self.first, first_key)
+        second_shapes = find_shapes(self.second, second_key)
+        return [(min(i, j), max(i, j)) for i in first_shapes for j in second_shapes]
 
     def is_active(self, names: Sequence[str], states: Floats) -> Bools:
         """Return at which states the exemption is active, shape (S,)."""
@@ -167,7 +169,8 @@ def make_shape_keys(labels: Sequence[str], names: Sequence[str]) -> list[str]:
     keys = []
     for label, name in zip(labels, names, strict=True):
         owner, dot, link = label.partition(".")
-        keys.append(f"{owner}.{link}_{name.rpartition('_')[2]}" if dot else name)
+        _, _, number = name.rpartition("_")
+        keys.append(f"{owner}.{link}_{number}" if dot else name)
     return keys
 
 
@@ -178,22 +181,16 @@ def find_clearance_exemptions(scene: _Scene, dist_safe: float) -> tuple[Clearanc
     """
 
     def find() -> tuple[ClearanceExemption, ...]:
-        listed = [
-            ClearanceExemption(min(pair), max(pair), margin, margin)
-            for pair, margin in scene.allowed.items()
-            if len(pair) == 2
-        ]
-        return *listed, *_find_neighbours(scene, dist_safe)
+        found = list[ClearanceExemption]()
+        for pair, margin in scene.allowed.items():
+            # A pair of a link with itself has one label.
+            if len(pair) == 2:
+                found.append(ClearanceExemption(min(pair), max(pair), margin, margin))
+        found += _find_neighbours(scene, dist_safe)
+        return tuple(found)
 
-    return get_cached(
-        scene,
-        (
-            "clearance_exemptions",
-            dist_safe,
-            *(make_state_key(placed) for placed in scene.objects.values()),
-        ),
-        find,
-    )
+    states = [make_state_key(placed) for placed in scene.objects.values()]
+    return get_cached(scene, ("clearance_exemptions", dist_safe, *states), find)
 
 
 def find_close_pairs(scene: _Scene, reach: float) -> list[ClosePair]:
@@ -202,30 +199,36 @@ def find_close_pairs(scene: _Scene, reach: float) -> list[ClosePair]:
     Held objects, pairs of links of one object, pairs that the scene allows, and fixed objects on
     the floor are left out; so are free objects on their support, unless they overlap it.
     """
-    shapes, found = PlacedShapes(scene, scene.objects), []
+    shapes = PlacedShapes(scene, scene.objects)
+    found = []
     for (first, second), distance in shapes.find_near_links(reach).items():
-        free = any(
-            scene.objects[label.partition(".")[0]].object.free
-            for label in (first, second)
-            if "." in label
-        )
-        if frozenset((first, second)) not in scene.allowed and (
-            not free or distance < -CONTACT_DEPTH
-        ):
+        if frozenset((first, second)) in scene.allowed:
+            continue
+        has_free = _is_on_free_object(scene, first) or _is_on_free_object(scene, second)
+        if not has_free or distance < -CONTACT_DEPTH:
             found.append(ClosePair(first, second, distance))
     return sorted(found, key=lambda pair: pair.distance)
+
+
+def _is_on_free_object(scene: _Scene, label: str) -> bool:
+    """Return whether a label is that of a link of a free object."""
+    owner, dot, _ = label.partition(".")
+    return bool(dot) and scene.objects[owner].object.free
 
 
 def warn_of_overlaps(scene: _Scene, name: str) -> None:
     """Warn of movable links that overlap other shapes in the scene called `name`."""
     found = [pair for pair in find_close_pairs(scene, 0.0) if pair.distance < -CONTACT_DEPTH]
-    if found:
-        pairs = "; ".join(map(str, found[:_MAX_NAMED])) + (
-            f"; and {len(found) - _MAX_NAMED} more" if len(found) > _MAX_NAMED else ""
-        )
-        hint = "They may stay that deep in each other. `allow:` in the scene permits contact; "
-        hint += "`vkc-pin check` lists all pairs."
-        warnings.warn(f"{name}: movable links overlap other shapes: {pairs}. {hint}", stacklevel=4)
+    if not found:
+        return
+    pairs = "; ".join(map(str, found[:_MAX_NAMED]))
+    if len(found) > _MAX_NAMED:
+        pairs += f"; and {len(found) - _MAX_NAMED} more"
+    warnings.warn(
+        f"{name}: movable links overlap other shapes: {pairs}. They may stay that deep in each "
+        "other. `allow:` in the scene permits contact; `vkc-pin check` lists all pairs.",
+        stacklevel=4,
+    )
 
 
 def _find_neighbours(scene: _Scene, dist_safe: float) -> Iterator[ClearanceExemption]:
@@ -233,37 +236,37 @@ def _find_neighbours(scene: _Scene, dist_safe: float) -> Iterator[ClearanceExemp
 
     Two states are examined: the initial one, and that with all joints at zero.
     """
-    jointed = {name: placed for name, placed in scene.objects.items() if not placed.object.free}
-    zero = {
-        name: dataclasses.replace(
-            placed, state=np.clip(0.0, placed.object.lower, placed.object.upper)
-        )
-        for name, placed in jointed.items()
-    }
-    differs = any(np.any(zero[name].state != placed.state) for name, placed in jointed.items())
-    known = set[tuple[tuple[str, str], float, tuple[tuple[str, tuple[float, float]], ...]]]()
-    for objects in [jointed, zero] if differs else [jointed]:
-        is_start = objects is jointed
-        standing = PlacedShapes(scene, objects)
-        near = standing.find_near_shapes(dist_safe - ACCEPTED_SHORTFALL)
+    initial = {name: placed for name, placed in scene.objects.items() if not placed.object.free}
+    zero = dict[str, PlacedObject]()
+    differs = False
+    for name, placed in initial.items():
+        state = np.clip(0.0, placed.object.lower, placed.object.upper)
+        zero[name] = dataclasses.replace(placed, state=state)
+        differs = differs or bool(np.any(state != placed.state))
+    known = set[Hashable]()
+    for objects in [initial, zero] if differs else [initial]:
+        is_initial = objects is initial
+        fixed = PlacedShapes(scene, objects)
+        near = fixed.find_near_shapes(dist_safe - ACCEPTED_SHORTFALL)
         for (i, j), distance in near.items():
-            if not is_start and distance < -MODEL_ERROR:
-                continue  # an obstacle: either the initial state has this overlap, too, or none
-            stretches = standing.find_near_stretches(i, j, dist_safe)
+            # Such a shape is an obstacle: either the initial state has this overlap, too, or none.
+            if not is_initial and distance < -MODEL_ERROR:
+                continue
+            stretches = fixed.find_near_stretches(i, j, dist_safe)
             if distance >= -CONTACT_DEPTH:
                 margin = 0.0
-            elif is_start:
-                margin = -standing.find_allowed_depth(i, j, distance, stretches)
+            elif is_initial:
+                margin = -fixed.find_allowed_depth(i, j, distance, stretches)
             else:
                 margin = -MODEL_ERROR
             ranges = {name: (one.lower, one.upper) for name, one in stretches.items()}
-            shapes = (standing.keys[i], standing.keys[j])
+            shapes = (fixed.keys[i], fixed.keys[j])
             key = (shapes, margin, tuple(ranges.items()))
             if key not in known:
                 known.add(key)
                 yield ClearanceExemption(
-                    standing.labels[i],
-                    standing.labels[j],
+                    fixed.labels[i],
+                    fixed.labels[j],
                     margin,
                     distance,
                     ranges,
@@ -304,18 +307,21 @@ class PlacedShapes:
 
     def __init__(self, scene: _Scene, objects: Mapping[str, PlacedObject]) -> None:
         self.scene = scene
-        self.objects = {n: p for n, p in objects.items() if not (p.object.free and n in scene.held)}
-        self._shapes, self.labels = list[pin.GeometryObject](), list[str]()
+        self.objects = dict[str, PlacedObject]()
+        for name, placed in objects.items():
+            is_in_hand = placed.object.free and name in scene.held
+            if not is_in_hand:
+                self.objects[name] = placed
+        self._shapes = list[pin.GeometryObject]()
+        self.labels = list[str]()
         for name, placed in self.objects.items():
             shapes = make_world_shapes(placed)
             self._shapes += shapes
             self.labels += [f"{name}.{get_link_name(shape.name)}" for shape in shapes]
-        free = {name for name, placed in self.objects.items() if placed.object.free}
-        self._moving = {
-            label
-            for label in set(self.labels)
-            if label.partition(".")[0] in free or self.find_joints(label)
-        }
+        self._moving = set[str]()  # labels of links of free objects, and of those moved by joints
+        for label in set(self.labels):
+            if self._get_owner(label).object.free or self.find_joints(label):
+                self._moving.add(label)
         if self._moving:
             self._shapes += scene.obstacles
             self.labels += scene.obstacle_labels
@@ -326,18 +332,20 @@ class PlacedShapes:
         if not self._moving:
             return {}
         boxes = [compute_world_box(shape.geometry, shape.placement) for shape in self._shapes]
-        lower, upper = (np.array(side).T for side in zip(*boxes, strict=True))
+        lower = np.array([low for low, _ in boxes])
+        upper = np.array([high for _, high in boxes])
         owners = np.array([label.partition(".")[0] for label in self.labels])
-        floor, found = owners == FLOOR, dict[tuple[int, int], float]()
+        is_floor = owners == FLOOR
+        found = dict[tuple[int, int], float]()
         for i, (label, shape) in enumerate(zip(self.labels, self._shapes, strict=True)):
             if label not in self._moving:
                 continue
-            close = ((lower < upper[:, [i]] + reach) & (upper > lower[:, [i]] - reach)).all(
-                axis=0
-            ) & (owners != owners[i])
-            if not self.objects[str(owners[i])].object.free:
-                close &= ~floor  # its height above the floor is given
-            for j in np.flatnonzero(close).tolist():
+            boxes_meet = (lower < upper[i] + reach) & (upper > lower[i] - reach)
+            is_close = boxes_meet.all(axis=1) & (owners != owners[i])
+            # The height of a fixed object above the floor is given.
+            if not self._get_owner(label).object.free:
+                is_close &= ~is_floor
+            for j in np.flatnonzero(is_close).tolist():
                 if (j, i) in found:
                     continue
                 other = self._shapes[j]
@@ -348,17 +356,24 @@ class PlacedShapes:
                     found[i, j] = distance
         return found
 
+    def _get_owner(self, label: str) -> PlacedObject:
+        """Return the object of a link, given by its label."""
+        name, _, _ = label.partition(".")
+        return self.objects[name]
+
     def find_near_links(self, reach: float) -> dict[tuple[str, str], float]:
         """Return pairs of link labels closer than `reach` [m] → smallest distance [m]."""
         found: dict[tuple[str, str], float] = {}
         for (i, j), distance in self.find_near_shapes(reach).items():
             pair = (self.labels[i], self.labels[j])
-            pair = pair[::-1] if pair[::-1] in found else pair
+            reverse = (self.labels[j], self.labels[i])
+            if reverse in found:
+                pair = reverse
             found[pair] = min(distance, found.get(pair, np.inf))
         return found
 
     def find_near_stretches(self, i: int, j: int, reach: float) -> dict[str, NearStretch]:
-        """Return how far each joint alone can move until two shapes are `reach` [m] apart.
+        """Return the ranges on which each joint alone keeps two shapes closer than `reach` [m].
 
         Args:
             i: Index of one shape.
@@ -367,10 +382,13 @@ class PlacedShapes:
         """
         found = dict[str, NearStretch]()
         for own, other in ((i, j), (j, i)):
-            owner = self.labels[own].partition(".")[0]
+            owner, _, _ = self.labels[own].partition(".")
+            other_owner, _, _ = self.labels[other].partition(".")
+            states = list[Hashable]()
+            for name in (owner, other_owner):
+                if name in self.objects:
+                    states.append(make_state_key(self.objects[name]))
             for joint in self.find_joints(self.labels[own]):
-                names = (owner, self.labels[other].partition(".")[0])
-                where = [self.objects[name] for name in names if name in self.objects]
                 key = (
                     "neighbours",
                     self.keys[own],
@@ -378,51 +396,37 @@ class PlacedShapes:
                     self.keys[other],
                     joint,
                     reach,
-                    *map(make_state_key, where),
+                    *states,
                 )
-                found[f"{owner}.{joint}"] = get_cached(
-                    self.scene, key, partial(self._find_near_stretch, own, other, joint, reach)
-                )
+                find = partial(self._find_near_stretch, own, other, joint, reach)
+                found[f"{owner}.{joint}"] = get_cached(self.scene, key, find)
         return found
 
     def _find_near_stretch(self, own: int, other: int, joint: str, reach: float) -> NearStretch:
-        placed = self.objects[self.labels[own].partition(".")[0]]
+        label = self.labels[own]
+        placed = self._get_owner(label)
         index = placed.object.coordinates.index(joint)
-        at, ends = float(placed.state[index]), list[float]()
-        nearest, farthest = np.inf, -np.inf
+        number_in_link = self.labels[:own].count(label)
 
-        def distance(values: Floats) -> Floats:
-            found: Floats = self.compute_distances(self.labels[own], index, values, [other], reach)[
-                :, self.labels[:own].count(self.labels[own]), 0
-            ]
-            return found
+        def measure(values: Floats) -> Floats:
+            """Return the distances of the two shapes for values of the joint, shape (V,) [m]."""
+            distances = self.compute_distances(label, index, values, [other], reach)
+            return np.asarray(distances[:, number_in_link, 0])
 
-        for limit, beyond in (
-            (placed.object.lower[index], -_TURN),
-            (placed.object.upper[index], _TURN),
-        ):
-            end = float(limit) if np.isfinite(limit) else at + beyond
-            low, high, left = at, end, False
-            for _ in range(2):
-                values = np.linspace(low, high, _STEPS + 1)
-                apart = distance(values)
-                inside = (
-                    apart[: int(np.argmax(apart >= reach))] if (apart >= reach).any() else apart
-                )
-                if len(inside) and not left:
-                    k = int(np.argmin(inside))
-                    around = np.linspace(
-                        values[max(k - 1, 0)], values[min(k + 1, _STEPS)], _STEPS + 1
-                    )
-                    nearest = min(nearest, float(inside[k]), float(distance(around).min()))
-                    farthest = max(farthest, float(inside.max()))
-                if len(inside) == len(apart):
-                    break
-                left, k = True, len(inside)
-                low, high = (float(values[max(k - 1, 0)]), float(values[k]))
-            ends.append((low + high) / 2.0 if left else float(np.copysign(np.inf, beyond)))
-        turns = placed.object.coordinates.units[index] == "rad"
-        return NearStretch(ends[0], ends[1], nearest, farthest, turns)
+        position = float(placed.state[index])
+        lower = float(placed.object.lower[index])
+        upper = float(placed.object.upper[index])
+        lowest = lower if np.isfinite(lower) else position - _TURN
+        highest = upper if np.isfinite(upper) else position + _TURN
+        low_end, low_nearest, low_farthest = _follow_joint(measure, position, lowest, reach)
+        high_end, high_nearest, high_farthest = _follow_joint(measure, position, highest, reach)
+        return NearStretch(
+            lower=-np.inf if low_end is None else low_end,
+            upper=np.inf if high_end is None else high_end,
+            nearest=min(low_nearest, high_nearest),
+            farthest=max(low_farthest, high_farthest),
+            turns=placed.object.coordinates.units[index] == "rad",
+        )
 
     def find_allowed_depth(
         self, i: int, j: int, distance: float, stretches: Mapping[str, NearStretch]
@@ -443,12 +447,19 @@ class PlacedShapes:
             The depth; infinite where no value of their only joint could exceed it.
         """
         depth = -distance + CONTACT_DEPTH
-        if not all(one.turns and one.overlaps_throughout for one in stretches.values()):
+        is_hinged_inside = all(one.turns and one.overlaps_throughout for one in stretches.values())
+        if not is_hinged_inside:
             return max(depth, MODEL_ERROR)
-        moving = [self._shapes[k] for k in (i, j) if self.find_joints(self.labels[k])]
-        depth += min(2.0 * float(compute_bounding_box(shape)[1].min()) for shape in moving)
+        thicknesses = []
+        for k in (i, j):
+            if self.find_joints(self.labels[k]):
+                _, half_extents = compute_bounding_box(self._shapes[k])
+                thicknesses.append(2.0 * float(half_extents.min()))
+        depth += min(thicknesses)
         deepest = max(-one.nearest for one in stretches.values())
-        return np.inf if len(stretches) == 1 and deepest <= depth else max(depth, MODEL_ERROR)
+        if len(stretches) == 1 and deepest <= depth:
+            return np.inf
+        return max(depth, MODEL_ERROR)
 
     def find_shapes(self, labels: Collection[str]) -> list[int]:
         """Return the indices of the shapes of links or obstacles, given by their labels."""
@@ -469,15 +480,16 @@ class PlacedShapes:
         Returns:
             Shape (V, K, O).
         """
-        own = find_link_shapes(self.objects[label.partition(".")[0]], label.partition(".")[2])
+        _, _, link = label.partition(".")
+        own = find_link_shapes(self._get_owner(label), link)
         targets = [self._shapes[k] for k in others]
-        shapes = Shapes(
-            [shape.geometry for shape in (*own, *targets)], [shape.placement for shape in targets]
-        )
-        where, near = self._sweep_link(label, index, values, targets, reach)
-        row, k, j = np.nonzero(near)
-        found = np.full(near.shape, np.inf)
-        found[row, k, j] = shapes.compute_distances(where, row, np.column_stack([k, len(own) + j]))
+        geometries = [shape.geometry for shape in (*own, *targets)]
+        shapes = Shapes(geometries, [shape.placement for shape in targets])
+        placements, is_near = self._sweep_link(label, index, values, targets, reach)
+        row, k, j = np.nonzero(is_near)
+        pairs = np.column_stack([k, len(own) + j])
+        found = np.full(is_near.shape, np.inf)
+        found[row, k, j] = shapes.compute_distances(placements, row, pairs)
         return found
 
     def find_links_near_sweep(self, label: str, index: int, values: Floats) -> set[str]:
@@ -488,8 +500,8 @@ class PlacedShapes:
             index: Index of the coordinate of its object.
             values: Values of the coordinate, shape (V,), [rad] or [m].
         """
-        _, near = self._sweep_link(label, index, values, self._shapes, 0.0)
-        return {self.labels[j] for j in np.flatnonzero(near.any(axis=(0, 1)))}
+        _, is_near = self._sweep_link(label, index, values, self._shapes, 0.0)
+        return {self.labels[j] for j in np.flatnonzero(is_near.any(axis=(0, 1)))}
 
     def _sweep_link(
         self,
@@ -499,17 +511,20 @@ class PlacedShapes:
         others: Sequence[pin.GeometryObject],
         reach: float,
     ) -> tuple[Floats, Bools]:
-        """Return placements of a link's shapes for values of a coordinate, and near pairs."""
-        owner, _, link = label.partition(".")
-        where, lower, upper = sweep_link_shapes(self.objects[owner], link, index, values)
-        lows, highs = (
-            np.array(side)
-            for side in zip(
-                *(compute_world_box(s.geometry, s.placement) for s in others), strict=True
-            )
-        )
-        near = (lows < upper[:, :, None] + reach) & (highs > lower[:, :, None] - reach)
-        return where, np.asarray(near.all(axis=3))
+        """Return placements of a link's shapes for values of a coordinate, and near pairs.
+
+        Returns:
+            Placements of the K shapes at V values, shape (V, K, 12), and whether their bounding
+                boxes are closer to those of the O others than `reach`, shape (V, K, O).
+        """
+        _, _, link = label.partition(".")
+        placements, lower, upper = sweep_link_shapes(self._get_owner(label), link, index, values)
+        boxes = [compute_world_box(shape.geometry, shape.placement) for shape in others]
+        other_lower = np.array([low for low, _ in boxes])
+        other_upper = np.array([high for _, high in boxes])
+        is_below = other_lower < upper[:, :, None] + reach
+        is_above = other_upper > lower[:, :, None] - reach
+        return placements, np.asarray((is_below & is_above).all(axis=3))
 
     def find_joints(self, label: str) -> list[str]:
         """Return the joints that move a link of a fixed object; for other links, none."""
@@ -517,8 +532,53 @@ class PlacedShapes:
         if owner not in self.objects or self.objects[owner].object.free:
             return []
         item = self.objects[owner].object
-        support = item.model.supports[item.model.frames[item.link_frame(link)].parentJoint]
+        frame = item.model.frames[item.link_frame(link)]
+        support = item.model.supports[frame.parentJoint]
         return [str(item.model.names[joint]) for joint in support if joint]
+
+
+def _follow_joint(
+    measure: Callable[[Floats], Floats], start: float, end: float, reach: float
+) -> tuple[float | None, float, float]:
+    """Follow the distance of two shapes while a joint moves until they are apart.
+
+    Args:
+        measure: Returns the distances [m] for values of the joint, shape (V,) each.
+        start: Value at which the joint starts, [rad] or [m].
+        end: Last value.
+        reach: Distance at which the shapes are apart [m].
+
+    Returns:
+        The value at which they get apart, or None; and the smallest and the largest distance on
+            the path to it [m], or inf and -inf if they are apart from the start.
+    """
+    values = np.linspace(start, end, _STEPS + 1)
+    distances = measure(values)
+    count = _count_near(distances, reach)
+    nearest = np.inf
+    farthest = -np.inf
+    if count:
+        near = distances[:count]
+        k = int(np.argmin(near))
+        around = np.linspace(values[max(k - 1, 0)], values[min(k + 1, _STEPS)], _STEPS + 1)
+        nearest = min(float(near[k]), float(measure(around).min()))
+        farthest = float(near.max())
+    if count == len(values):
+        return None, nearest, farthest
+    low = float(values[max(count - 1, 0)])
+    high = float(values[count])
+    values = np.linspace(low, high, _STEPS + 1)
+    count = _count_near(measure(values), reach)
+    if count < len(values):
+        low = float(values[max(count - 1, 0)])
+        high = float(values[count])
+    return (low + high) / 2.0, nearest, farthest
+
+
+def _count_near(distances: Floats, reach: float) -> int:
+    """Return how many distances precede the first one of at least `reach` [m]."""
+    is_apart = distances >= reach
+    return int(np.argmax(is_apart)) if is_apart.any() else len(distances)
 
 
 def get_cached(scene: _Scene, key: Hashable, make: Callable[[], T]) -> T:
@@ -527,7 +587,8 @@ def get_cached(scene: _Scene, key: Hashable, make: Callable[[], T]) -> T:
     if found is None:
         if len(scene.memory) >= _MAX_CACHED:
             scene.memory.clear()
-        found = scene.memory[key] = make()
+        found = make()
+        scene.memory[key] = found
     return found
 
 

@@ -31,6 +31,7 @@ grasped or released, and before the motion; after the last grasp it stays.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from functools import partial
 
 import coal
 import numpy as np
@@ -92,11 +93,14 @@ def find_grasp_distances(scene: Scene, hold: Hold) -> Mapping[str, float]:
     attachment = _get_attachment(scene, hold)
     if hold.by is not None or attachment.freedoms or attachment.contact == "push":
         return {}
-    placed, links = scene.objects[hold.object], find_touch_links(scene, hold)
+    placed = scene.objects[hold.object]
+    links = find_touch_links(scene, hold)
+
+    def compute() -> Mapping[str, float]:
+        return _compute_distances(_place_hand(scene, hold, placed, links), placed)
+
     key = (hold.object, hold.attachment, "grasp", make_state_key(placed))
-    return get_cached(
-        scene, key, lambda: _compute_distances(_place_hand(scene, hold, placed, links), placed)
-    )
+    return get_cached(scene, key, compute)
 
 
 def _measure_hand_distances(scene: Scene, hold: Hold) -> Mapping[str, float]:
@@ -104,25 +108,27 @@ def _measure_hand_distances(scene: Scene, hold: Hold) -> Mapping[str, float]:
 
     The distance is the smaller one of those at the start and in the grasp, if they differ.
     """
-    (own,) = (one for one in scene.holds if one == hold)
-    placed, links = scene.objects[hold.object], find_touch_links(scene, hold)
-    key = (hold, own.at, scene.start.tobytes(), make_state_key(placed))
-    return get_cached(scene, key, lambda: _compute_hand_distances(scene, own, placed, links))
+    (start_hold,) = (one for one in scene.holds if one == hold)
+    placed = scene.objects[hold.object]
+    links = find_touch_links(scene, hold)
+    key = (hold, start_hold.at, scene.start.tobytes(), make_state_key(placed))
+    compute = partial(_compute_hand_distances, scene, start_hold, placed, links)
+    return get_cached(scene, key, compute)
 
 
 def _compute_hand_distances(
     scene: Scene, hold: Hold, placed: PlacedObject, links: Collection[str]
 ) -> Mapping[str, float]:
-    if hold.by is not None:  # such an object is placed in the hand
-        hand = [
-            shape
-            for shape in make_world_shapes(scene.objects[hold.by.object])
-            if f"{hold.by.object}.{get_link_name(shape.name)}" in links
-        ]
-        hands = list_placed_shapes(hand)
-    else:
-        hands = _place_hand(scene, hold, placed, links, include_start=True)
-    return _compute_distances(hands, placed)
+    if hold.by is None:
+        grasping = _place_hand(scene, hold, placed, links, include_start=True)
+        return _compute_distances(grasping, placed)
+    # The object that grasps is placed in the hand.
+    carrier = hold.by.object
+    shapes = make_world_shapes(scene.objects[carrier])
+    grasping_shapes = [
+        shape for shape in shapes if f"{carrier}.{get_link_name(shape.name)}" in links
+    ]
+    return _compute_distances(list_placed_shapes(grasping_shapes), placed)
 
 
 def _place_hand(
@@ -134,32 +140,39 @@ def _place_hand(
     include_start: bool = False,
 ) -> list[PlacedShape]:
     """Return the shapes of the grasping links in the grasp, and as at the start if asked to."""
-    attachment, robot = get_attachment(scene.objects, hold), scene.robot
+    robot = scene.robot
+    attachment = get_attachment(scene.objects, hold)
     grasp = placed.link_placement(attachment.link) * attachment.tool(hold.at)
+    # Displacement in the world frame that takes the hand from the start to the grasp.
     to_grasp = grasp * scene.tool_placement().inverse()
     geometry = robot.opened(compute_grasp_opening(scene, hold)).collision
-    data, shapes = robot.model.createData(), geometry.createData()
-    pin.updateGeometryPlacements(
-        robot.model, data, geometry, shapes, robot.coordinates.q(scene.start)
-    )
-    moves = [pin.SE3.Identity(), to_grasp] if include_start else [to_grasp]
-    return [
-        (geometry.geometryObjects[i].geometry, moved * shapes.oMg[i])
-        for i in range(len(shapes.oMg))
-        if robot.link_of(i) in links
-        for moved in moves
-    ]
+    model_data = robot.model.createData()
+    geometry_data = geometry.createData()
+    q = robot.coordinates.q(scene.start)
+    pin.updateGeometryPlacements(robot.model, model_data, geometry, geometry_data, q)
+    displacements = [pin.SE3.Identity(), to_grasp] if include_start else [to_grasp]
+    placed_shapes = list[PlacedShape]()
+    for i, at_start in enumerate(geometry_data.oMg):
+        if robot.link_of(i) in links:
+            solid = geometry.geometryObjects[i].geometry
+            for displacement in displacements:
+                placed_shapes.append((solid, displacement * at_start))
+    return placed_shapes
 
 
-def _compute_distances(hands: Sequence[PlacedShape], placed: PlacedObject) -> Mapping[str, float]:
+def _compute_distances(
+    grasping: Sequence[PlacedShape], placed: PlacedObject
+) -> Mapping[str, float]:
     """Return link of an object → its distance from some shapes [m]."""
-    found: dict[str, list[pin.GeometryObject]] = {}
+    shapes_by_link: dict[str, list[pin.GeometryObject]] = {}
     for shape in make_world_shapes(placed):
-        found.setdefault(get_link_name(shape.name), []).append(shape)
-    return {
-        f"{placed.name}.{link}": compute_clearance(hands, list_placed_shapes(shapes))
-        for link, shapes in found.items()
-    }
+        shapes = shapes_by_link.setdefault(get_link_name(shape.name), [])
+        shapes.append(shape)
+    distances = {}
+    for link, shapes in shapes_by_link.items():
+        distance = compute_clearance(grasping, list_placed_shapes(shapes))
+        distances[f"{placed.name}.{link}"] = distance
+    return distances
 
 
 def compute_hand_frame(robot: Robot, attachment: Attachment) -> pin.SE3:
@@ -180,7 +193,10 @@ def is_rigid_grasp(scene: Scene, hold: Hold) -> bool:
 
 def find_gripper_hold(holds: Iterable[Hold]) -> Hold | None:
     """Return the hold of the gripper itself, not one through a grasped object; None: none."""
-    return next((hold for hold in holds if hold.by is None), None)
+    for hold in holds:
+        if hold.by is None:
+            return hold
+    return None
 
 
 def compute_grasp_opening(scene: Scene, hold: Hold) -> float | None:

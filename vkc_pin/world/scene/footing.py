@@ -84,10 +84,10 @@ def find_footing(
     pairs = find_supporting_pairs(placed, shapes)
     if not pairs:
         return _measure_fall(placed, shapes)
-    supports = tuple(sorted({label for label, _, _ in pairs}))
+    supports = {label for label, _, _ in pairs}
     centre = _compute_centre([placed, *load])
     overhang = _compute_overhang(centre, [(one, shape) for _, one, shape in pairs])
-    return Footing(supports, overhang=overhang)
+    return Footing(tuple(sorted(supports)), overhang=overhang)
 
 
 def _compute_centre(objects: Sequence[PlacedObject]) -> Floats:
@@ -97,22 +97,30 @@ def _compute_centre(objects: Sequence[PlacedObject]) -> Floats:
     """
     total = pin.Inertia.Zero()
     for placed in objects:
-        item = placed.object
-        data = item.model.createData()
-        pin.forwardKinematics(item.model, data, item.coordinates.q(placed.state))
-        bodies = zip(data.oMi, item.model.inertias, strict=True)
-        whole = sum((pose.act(inertia) for pose, inertia in bodies), pin.Inertia.Zero())
-        total += placed.placement.act(whole) if item.mass > 0.0 else _fill_with_water(placed)
+        if placed.object.mass > 0.0:
+            total += placed.placement.act(_compute_inertia(placed))
+        else:
+            total += _fill_with_water(placed)
     return np.asarray(total.lever)
+
+
+def _compute_inertia(placed: PlacedObject) -> pin.Inertia:
+    """Return the inertia of an object with its joint values, in the frame of its base link."""
+    item = placed.object
+    data = item.model.createData()
+    pin.forwardKinematics(item.model, data, item.coordinates.q(placed.state))
+    total = pin.Inertia.Zero()
+    for joint_placement, inertia in zip(data.oMi, item.model.inertias, strict=True):
+        total = total + joint_placement.act(inertia)
+    return total
 
 
 def _fill_with_water(placed: PlacedObject) -> pin.Inertia:
     """Return the inertia of an object's shapes as solids of 1000 kg/m³, in the world frame."""
-    bodies = [
-        shape.placement.act(compute_solid_inertia(shape, 1000.0))
-        for shape in make_world_shapes(placed)
-    ]
-    return sum(bodies, pin.Inertia.Zero())
+    total = pin.Inertia.Zero()
+    for shape in make_world_shapes(placed):
+        total = total + shape.placement.act(compute_solid_inertia(shape, 1000.0))
+    return total
 
 
 def _compute_overhang(
@@ -130,36 +138,39 @@ def _compute_overhang(
 
     count = len(pairs)
     size = 4 * count + 1
-    # Seen from a higher origin, the object is lower.
+    # The unknowns are y (3 for each region), λ (1 for each region) and t. The centre of mass is
+    # the origin; seen from a higher origin, the object is lower.
     higher = centre + np.array([0.0, 0.0, RESTING_DISTANCE])
-    rows, bounds = list[Floats](), list[Floats]()
+    rows = list[Floats]()
     for k, (one, shape) in enumerate(pairs):
         normals, offsets = _list_faces(one, higher)
-        others, other_offsets = _list_faces(shape, centre)
-        row = np.zeros((len(normals) + len(others), size))
-        row[:, 3 * k : 3 * k + 3] = np.vstack([normals, others])
+        other_normals, other_offsets = _list_faces(shape, centre)
+        # N_k y_k − λ_k d_k ≤ 0
+        row = np.zeros((len(normals) + len(other_normals), size))
+        row[:, 3 * k : 3 * k + 3] = np.vstack([normals, other_normals])
         row[:, 3 * count + k] = -np.concatenate([offsets, other_offsets])
         rows.append(row)
-        bounds.append(np.zeros(len(row)))
     for axis in (0, 1):
         for sign in (1.0, -1.0):
+            # ± Σ y_k − t ≤ 0
             row = np.zeros((1, size))
             row[0, axis : 3 * count : 3] = sign
             row[0, -1] = -1.0
             rows.append(row)
-            bounds.append(np.zeros(1))
+    matrix = np.vstack(rows)
     cost = np.zeros(size)
     cost[-1] = 1.0
-    shares = np.zeros((1, size))
-    shares[0, 3 * count : 4 * count] = 1.0
-    free = [(None, None)] * (3 * count)
+    sum_of_weights = np.zeros((1, size))
+    sum_of_weights[0, 3 * count : 4 * count] = 1.0
+    unbounded = (None, None)
+    not_negative = (0.0, None)
     found = linprog(
         cost,
-        A_ub=np.vstack(rows),
-        b_ub=np.concatenate(bounds),
-        A_eq=shares,
+        A_ub=matrix,
+        b_ub=np.zeros(len(matrix)),
+        A_eq=sum_of_weights,
         b_eq=[1.0],
-        bounds=[*free, *[(0.0, None)] * (count + 1)],
+        bounds=[unbounded] * (3 * count) + [not_negative] * (count + 1),
     )
     return float(found.fun) if found.success else np.inf
 
@@ -190,15 +201,16 @@ def _compute_fall(one: pin.GeometryObject, shape: pin.GeometryObject) -> float:
 
     origin = one.placement.translation
     normals, offsets = _list_faces(one, origin)
-    others, other_offsets = _list_faces(shape, origin)
+    other_normals, other_offsets = _list_faces(shape, origin)
+    # n · x ≤ d of the first shape, and n · x − h n_z ≤ d of the other.
     first = np.hstack([normals, np.zeros((len(normals), 1))])
-    second = np.hstack([others, -others[:, 2:]])
-    free = [(None, None)] * 3
+    second = np.hstack([other_normals, -other_normals[:, 2:]])
+    unbounded = (None, None)
     found = linprog(
         [0.0, 0.0, 0.0, 1.0],
         A_ub=np.vstack([first, second]),
         b_ub=np.concatenate([offsets, other_offsets]),
-        bounds=[*free, (0.0, None)],
+        bounds=[unbounded, unbounded, unbounded, (0.0, None)],
     )
     return float(found.fun) if found.success else np.inf
 
@@ -208,9 +220,13 @@ def _list_faces(shape: pin.GeometryObject, origin: Floats) -> tuple[Floats, Floa
 
     The shape is {x: n · x ≤ d}, with x from an origin in the world frame.
     """
-    points = triangulate(shape.geometry)[0]
-    hull = compute_hull(points @ shape.placement.rotation.T + shape.placement.translation - origin)
+    vertices, _ = triangulate(shape.geometry)
+    points = vertices @ shape.placement.rotation.T + shape.placement.translation - origin
+    hull = compute_hull(points)
     normals = np.asarray(hull.face_normals, float)
-    offsets = np.einsum("fi,fi->f", normals, np.asarray(hull.triangles[:, 0], float))
-    faces = np.unique(np.round(np.column_stack([normals, offsets]), 9), axis=0)
+    first_corners = np.asarray(hull.triangles[:, 0], float)
+    offsets = np.einsum("fi,fi->f", normals, first_corners)
+    # Triangles of one face have one plane.
+    planes = np.column_stack([normals, offsets])
+    faces = np.unique(np.round(planes, 9), axis=0)
     return faces[:, :3], faces[:, 3]

@@ -17,8 +17,9 @@ if TYPE_CHECKING:
 
 FLOOR = "floor"
 """Name of the floor among a scene's obstacles."""
-_FLOOR_THICKNESS = 0.1
+_FLOOR_THICKNESS = 0.1  # [m]
 _FLOOR_BORDER = 2.0  # [m] beyond the arena: an arm may reach over its edge
+_FLOOR_COLOUR = (0.80, 0.78, 0.74, 1.0)
 
 
 def make_obstacle_shapes(
@@ -29,7 +30,8 @@ def make_obstacle_shapes(
 
     if isinstance(item, schema.UrdfSchema):
         return _make_urdf_shapes(item, pose, folder / item.file)
-    drawn_as, scale = "", np.ones(3)
+    mesh_path = ""
+    mesh_scale = np.ones(3)
     solid: coal.CollisionGeometry
     match item:
         case schema.BoxSchema():
@@ -43,11 +45,15 @@ def make_obstacle_shapes(
         case schema.MeshSchema():
             from vkc_pin.world.files.meshes import load_convex
 
-            drawn_as, scale = str(folder / item.file), np.array(item.scale)
-            solid = load_convex(drawn_as, scale, about=item.name)
-    drawn = _make_shape(item.name, pose, solid, item.colour)
-    drawn.meshPath, drawn.meshScale = drawn_as, scale
-    return [drawn], [_make_shape(item.name, pose, solid, item.colour)]
+            mesh_path = str(folder / item.file)
+            mesh_scale = np.array(item.scale)
+            solid = load_convex(mesh_path, mesh_scale, about=item.name)
+    visual = _make_shape(item.name, pose, solid, item.colour)
+    # Viewers draw the file.
+    visual.meshPath = mesh_path
+    visual.meshScale = mesh_scale
+    collision = _make_shape(item.name, pose, solid, item.colour)
+    return [visual], [collision]
 
 
 def make_floor_shape(arena: tuple[float, float, float, float]) -> pin.GeometryObject:
@@ -57,9 +63,11 @@ def make_floor_shape(arena: tuple[float, float, float, float]) -> pin.GeometryOb
         arena: (x_min, x_max, y_min, y_max) [m].
     """
     x_min, x_max, y_min, y_max = arena
-    size = (x_max - x_min + 2 * _FLOOR_BORDER, y_max - y_min + 2 * _FLOOR_BORDER, _FLOOR_THICKNESS)
-    centre = np.array([(x_min + x_max) / 2, (y_min + y_max) / 2, -_FLOOR_THICKNESS / 2])
-    return _make_shape(FLOOR, pin.SE3(np.eye(3), centre), coal.Box(*size), (0.80, 0.78, 0.74, 1.0))
+    length = x_max - x_min + 2 * _FLOOR_BORDER
+    width = y_max - y_min + 2 * _FLOOR_BORDER
+    center = np.array([(x_min + x_max) / 2, (y_min + y_max) / 2, -_FLOOR_THICKNESS / 2])
+    solid = coal.Box(length, width, _FLOOR_THICKNESS)
+    return _make_shape(FLOOR, pin.SE3(np.eye(3), center), solid, _FLOOR_COLOUR)
 
 
 def _make_urdf_shapes(
@@ -71,21 +79,20 @@ def _make_urdf_shapes(
     model, collision, visual = load_urdf(file)
     data = model.createData()
     pin.forwardKinematics(model, data, pin.neutral(model))
-    both = []
-    for geometry in (visual, collision):
-        shapes = geometry.geometryObjects
-        names = (
-            [item.name] if len(shapes) == 1 else [f"{item.name}_{k}" for k in range(len(shapes))]
-        )
-        both.append(
-            [
-                copy_shape(shape, name, pose * data.oMi[shape.parentJoint] * shape.placement)
-                for shape, name in zip(shapes, names, strict=True)
-            ]
-        )
-        for shape in both[-1] if item.colour else ():
-            shape.meshColor, shape.overrideMaterial = np.array(item.colour), True
-    return both[0], both[1]
+
+    def copy_shapes(geometry: pin.GeometryModel) -> list[pin.GeometryObject]:
+        copies = []
+        for k, shape in enumerate(geometry.geometryObjects):
+            name = item.name if len(geometry.geometryObjects) == 1 else f"{item.name}_{k}"
+            placement = pose * data.oMi[shape.parentJoint] * shape.placement
+            copy = copy_shape(shape, name, placement)
+            if item.colour:
+                copy.meshColor = np.array(item.colour)
+                copy.overrideMaterial = True
+            copies.append(copy)
+        return copies
+
+    return copy_shapes(visual), copy_shapes(collision)
 
 
 def _make_shape(
@@ -95,5 +102,6 @@ def _make_shape(
     colour: tuple[float, float, float, float],
 ) -> pin.GeometryObject:
     created = pin.GeometryObject(name, 0, 0, pose, shape)
-    created.meshColor, created.overrideMaterial = np.array(colour), True
+    created.meshColor = np.array(colour)
+    created.overrideMaterial = True
     return created

@@ -14,7 +14,7 @@ from vkc_pin.utils.arguments import check_mapping, check_number
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.pickling import freeze
 from vkc_pin.world.collision.solids import flatten_placements
-from vkc_pin.world.models.articulated_object import ArticulatedObject
+from vkc_pin.world.models.articulated_object import ArticulatedObject, Freedom
 from vkc_pin.world.models.shapes import (
     clamp_to_limits,
     compute_bounding_box,
@@ -46,10 +46,10 @@ class PlacedObject:
     reversed: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
-        state = ", ".join(
-            f"{n}={v:.4g}" for n, v in zip(self.object.coordinates.names, self.state, strict=True)
-        )
-        return f"<PlacedObject {self.name}: {self.object.name}{f', {state}' if state else ''}>"
+        parts = [self.object.name]
+        for joint, value in zip(self.object.coordinates.names, self.state, strict=True):
+            parts.append(f"{joint}={value:.4g}")
+        return f"<PlacedObject {self.name}: {', '.join(parts)}>"
 
     def with_state(self, values: Mapping[str, float]) -> PlacedObject:
         """Return a copy with joints at `values`; the other joints keep theirs.
@@ -61,16 +61,19 @@ class PlacedObject:
             UnknownNameError: It has no such joint.
             InputError: A value is not finite or outside the joint's limits.
         """
-        state, coordinates = self.state.copy(), self.object.coordinates
-        for joint, given in check_mapping(values, "values", "joints, each with its value").items():
+        coordinates = self.object.coordinates
+        state = self.state.copy()
+        stated = check_mapping(values, "values", "joints, each with its value")
+        for joint, given in stated.items():
+            field = f"{self.name}.{joint}"
             if joint not in coordinates.names:
-                raise UnknownNameError(
-                    f"joint of {self.name}", joint, coordinates.names, field=f"{self.name}.{joint}"
-                )
-            index, value = coordinates.index(joint), check_number(given, f"{self.name}.{joint}")
-            state[index] = clamp_to_limits(
-                value, self.object.lower[index], self.object.upper[index], f"{self.name}.{joint}"
-            )
+                kind = f"joint of {self.name}"
+                raise UnknownNameError(kind, joint, coordinates.names, field=field)
+            index = coordinates.index(joint)
+            value = check_number(given, field)
+            lower = self.object.lower[index]
+            upper = self.object.upper[index]
+            state[index] = clamp_to_limits(value, lower, upper, field)
         return dataclasses.replace(self, state=state)
 
     def with_reversed(self, attachment: str) -> PlacedObject:
@@ -81,18 +84,21 @@ class PlacedObject:
         Raises:
             UnknownNameError: It has no such attachment.
         """
-        given = self.object.attachment(attachment)
-        turned = [
-            dataclasses.replace(freedom, axis=_OTHER_SIDE.rotation @ freedom.axis)
-            for freedom in given.freedoms
-        ]
-        changed = dataclasses.replace(
-            given, placement=given.placement * _OTHER_SIDE, freedoms=tuple(turned)
+        described = self.object.attachment(attachment)
+        freedoms = list[Freedom]()
+        for freedom in described.freedoms:
+            axis = _OTHER_SIDE.rotation @ freedom.axis
+            freedoms.append(dataclasses.replace(freedom, axis=axis))
+        turned = dataclasses.replace(
+            described, placement=described.placement * _OTHER_SIDE, freedoms=tuple(freedoms)
         )
-        attachments = freeze({**self.object.attachments, attachment: changed})
-        listed = tuple(sorted({*self.reversed} ^ {attachment}))
+        attachments = freeze({**self.object.attachments, attachment: turned})
+        # An attachment that is reversed twice is as described.
+        all_reversed = {*self.reversed} ^ {attachment}
         return dataclasses.replace(
-            self, object=dataclasses.replace(self.object, attachments=attachments), reversed=listed
+            self,
+            object=dataclasses.replace(self.object, attachments=attachments),
+            reversed=tuple(sorted(all_reversed)),
         )
 
     def link_placement(self, link: str) -> pin.SE3:
@@ -111,14 +117,15 @@ def make_world_shapes(placed: PlacedObject, *, visual: bool = False) -> list[pin
         Shapes in the object's own order, with their names in the object (`<link>_<number>`).
     """
     item = placed.object
-    model, geometry = item.model, item.visual if visual else item.collision
-    data = model.createData()
-    pin.forwardKinematics(model, data, item.coordinates.q(placed.state))
-    places = [placed.placement * placement for placement in data.oMi]
-    return [
-        copy_shape(shape, shape.name, places[shape.parentJoint] * shape.placement)
-        for shape in geometry.geometryObjects
-    ]
+    geometry = item.visual if visual else item.collision
+    data = item.model.createData()
+    pin.forwardKinematics(item.model, data, item.coordinates.q(placed.state))
+    joint_placements = [placed.placement * placement for placement in data.oMi]
+    shapes = []
+    for shape in geometry.geometryObjects:
+        placement = joint_placements[shape.parentJoint] * shape.placement
+        shapes.append(copy_shape(shape, shape.name, placement))
+    return shapes
 
 
 def find_link_shapes(placed: PlacedObject, link: str) -> list[pin.GeometryObject]:
@@ -145,18 +152,26 @@ def sweep_link_shapes(
         Placements, shape (V, K, 12), see `solids.flatten_placements`, and lower and upper corners
             of the axis-aligned bounding boxes, both (V, K, 3) [m].
     """
-    model, own, state = placed.object.model, find_link_shapes(placed, link), placed.state.copy()
-    data, size = model.createData(), (len(values), len(own))
-    boxes = [compute_bounding_box(shape) for shape in own]
-    where, lower, upper = np.empty((*size, 12)), np.empty((*size, 3)), np.empty((*size, 3))
-    for row, value in enumerate(values):
+    model = placed.object.model
+    data = model.createData()
+    shapes = find_link_shapes(placed, link)
+    boxes = [compute_bounding_box(shape) for shape in shapes]
+    rows = np.empty((len(values), len(shapes), 12))
+    lower = np.empty((len(values), len(shapes), 3))
+    upper = np.empty((len(values), len(shapes), 3))
+    state = placed.state.copy()
+    for v, value in enumerate(values):
         state[index] = value
         pin.forwardKinematics(model, data, placed.object.coordinates.q(state))
         placements = [
-            placed.placement * data.oMi[shape.parentJoint] * shape.placement for shape in own
+            placed.placement * data.oMi[shape.parentJoint] * shape.placement for shape in shapes
         ]
-        where[row] = flatten_placements(placements)
-        for k, (placement, (center, half)) in enumerate(zip(placements, boxes, strict=True)):
-            middle, extent = placement.act(center), np.abs(placement.rotation) @ half
-            lower[row, k], upper[row, k] = middle - extent, middle + extent
-    return where, lower, upper
+        rows[v] = flatten_placements(placements)
+        for k, (placement, (center, half_extents)) in enumerate(
+            zip(placements, boxes, strict=True)
+        ):
+            world_center = placement.act(center)
+            extent = np.abs(placement.rotation) @ half_extents
+            lower[v, k] = world_center - extent
+            upper[v, k] = world_center + extent
+    return rows, lower, upper

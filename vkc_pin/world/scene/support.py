@@ -79,22 +79,27 @@ def find_supported_objects(
     Returns:
         Free object → "<object>.<link>" of the moving link at the bottom of the stack.
     """
-    shapes = [
-        (f"{name}.{link}", shape)
-        for name, links in moving.items()
-        for shape in make_world_shapes(objects[name])
-        if (link := get_link_name(shape.name)) in links
-    ]
-    remaining, found = [name for name in free if name not in moving], dict[str, str]()
+    shapes = list[tuple[str, pin.GeometryObject]]()
+    for name, links in moving.items():
+        for shape in make_world_shapes(objects[name]):
+            link = get_link_name(shape.name)
+            if link in links:
+                shapes.append((f"{name}.{link}", shape))
+    remaining = [name for name in free if name not in moving]
+    found = dict[str, str]()
+    # Each round finds the objects that rest on those found in the round before.
     while remaining and shapes:
-        on = {
-            name: min(labels)
-            for name in remaining
-            if (labels := find_supports(objects[name], shapes))
-        }
-        found |= {name: found.get(label, label) for name, label in on.items()}
-        remaining = [name for name in remaining if name not in on]
-        shapes = [(name, shape) for name in on for shape in make_world_shapes(objects[name])]
+        resting = dict[str, str]()
+        for name in remaining:
+            labels = find_supports(objects[name], shapes)
+            if labels:
+                support = min(labels)
+                resting[name] = found.get(support, support)
+        found.update(resting)
+        remaining = [name for name in remaining if name not in resting]
+        shapes = []
+        for name in resting:
+            shapes += [(name, shape) for shape in make_world_shapes(objects[name])]
     return found
 
 
@@ -107,9 +112,10 @@ def compute_tilt(before: pin.SE3, after: pin.SE3) -> float:
 def _is_supporting(shape: pin.GeometryObject, one: pin.GeometryObject) -> bool:
     """Return whether `shape` supports `one`, a shape of an object."""
 
-    def distance(shift: float) -> float:
+    def measure(shift: float) -> float:
+        """Return the distance of the two after a displacement by `shift` · `_DOWN` [m]."""
         moved = pin.SE3(one.placement.rotation, one.placement.translation + shift * _DOWN)
         return compute_shape_distance(one.geometry, moved, shape.geometry, shape.placement)
 
-    lowered = distance(1.0)
-    return lowered < -RESTING_DISTANCE / 2 and distance(-1.0) - lowered > RESTING_DISTANCE
+    lowered = measure(1.0)
+    return lowered < -RESTING_DISTANCE / 2 and measure(-1.0) - lowered > RESTING_DISTANCE

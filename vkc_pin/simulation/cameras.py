@@ -19,13 +19,17 @@ from vkc_pin.simulation.snapshots import RenderedScene
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.robot import Robot
 
-BASE, HAND = "base", "hand"
-"""Frames of every robot: that of the mobile base, and the tool frame, whose z axis points ahead and
-along whose x axis the fingers close."""
-_PARALLEL = 1e-6  # sine of the angle up to which two directions are parallel
+BASE = "base"
+"""Frame of every robot: that of the mobile base."""
+HAND = "hand"
+"""Frame of every robot: the tool frame, whose z axis points ahead and along whose x axis the
+fingers close."""
 ROBOT = "robot"
 """Name of the robot's links in segmentation images."""
-_MAX_DEPTH = 65_535  # [mm] in 16 bits; pixels further away count as empty
+# sine of the angle up to which two directions are parallel
+_PARALLEL = 1e-6
+# [mm] in 16 bits; pixels further away count as empty
+_MAX_DEPTH = 65_535
 
 
 @dataclass(frozen=True)
@@ -55,14 +59,14 @@ class Camera:
     fov: float = 60.0
 
     def __post_init__(self) -> None:
-        ahead, up = np.subtract(self.target, self.position), np.array(self.up)
+        ahead = np.subtract(self.target, self.position)
+        up = np.array(self.up)
         lengths = np.linalg.norm(ahead) * np.linalg.norm(up)
         if np.linalg.norm(np.cross(ahead, up)) <= _PARALLEL * lengths:
-            expected = "a target other than the camera's position, and not in the direction `up`"
             raise InputError(
                 f"the orientation of camera '{self.name}' is undefined",
                 field="target",
-                expected=expected,
+                expected="a target other than the camera's position, and not in the direction `up`",
                 got=list(self.target),
             )
 
@@ -73,9 +77,8 @@ class Camera:
         back /= np.linalg.norm(back)
         right = np.cross(self.up, back)
         right /= np.linalg.norm(right)
-        return pin.SE3(
-            np.column_stack([right, np.cross(back, right), back]), np.array(self.position)
-        )
+        rotation = np.column_stack([right, np.cross(back, right), back])
+        return pin.SE3(rotation, np.array(self.position))
 
     def find_frame(self, robot: Robot) -> str:
         """Return the frame of a robot's model on which the camera is mounted.
@@ -96,15 +99,10 @@ def resolve_frame(robot: Robot, frame: str) -> str:
 
 def check_frame(robot: Robot, frame: str) -> None:
     """Check that a robot has a frame."""
-    known = sorted(
-        {
-            BASE,
-            HAND,
-            *(str(one.name) for one in robot.model.frames if one.type == pin.FrameType.BODY),
-        }
-    )
+    bodies = {str(one.name) for one in robot.model.frames if one.type == pin.FrameType.BODY}
+    known = {BASE, HAND} | bodies
     if frame not in known:
-        raise UnknownNameError(f"frame of {robot.name}", frame, known)
+        raise UnknownNameError(f"frame of {robot.name}", frame, sorted(known))
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,9 +134,8 @@ class Images:
         """Return the images that `to_bytes` encoded."""
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
             names, segments = json.loads(str(archive["names"]))
-            return cls(
-                {name: archive[f"picture_{k}"] for k, name in enumerate(names)}, tuple(segments)
-            )
+            pictures = {name: archive[f"picture_{k}"] for k, name in enumerate(names)}
+            return cls(pictures, tuple(segments))
 
 
 def render_images(executed: Execution, cameras: Sequence[Camera], times: Floats) -> Images:
@@ -171,23 +168,22 @@ def render_images(executed: Execution, cameras: Sequence[Camera], times: Floats)
     scene = RenderedScene(executed, size=size, wall_opacity=1.0, add_extras=add_cameras)
     segments, numbers = _number_segments(scene)
     found: dict[str, list[NDArray[np.generic]]] = {}
-    for camera, picture in _render(scene, cameras, times, size):
-        for kind, pixels in zip(("image", "depth", "segmentation"), picture, strict=True):
-            found.setdefault(f"{camera}_{kind}", []).append(
-                numbers[pixels] if kind == "segmentation" else pixels
-            )
+    for camera, colours, depth, geoms in _render(scene, cameras, times, size):
+        found.setdefault(f"{camera}_image", []).append(colours)
+        found.setdefault(f"{camera}_depth", []).append(depth)
+        found.setdefault(f"{camera}_segmentation", []).append(numbers[geoms])
     return Images({name: np.array(values) for name, values in found.items()}, segments)
 
 
 def _render(
     scene: RenderedScene, cameras: Sequence[Camera], times: Floats, size: tuple[int, int]
 ) -> Any:
-    """Yield the images of every camera at every time."""
-    mj, model = scene.mj, scene.model
+    """Yield the name of every camera at every time, with colours, depth and geoms that it sees."""
+    mj = scene.mj
+    model = scene.model
+    near = float(model.vis.map.znear * model.stat.extent)
+    far = float(model.vis.map.zfar * model.stat.extent)
     view = mj.MjvCamera()
-    near, far = (
-        float(limit * model.stat.extent) for limit in (model.vis.map.znear, model.vis.map.zfar)
-    )
     view.type = mj.mjtCamera.mjCAMERA_FIXED
     flags = [int(mj.mjtRndFlag.mjRND_SEGMENT), int(mj.mjtRndFlag.mjRND_IDCOLOR)]
     for data, gl_scene, gl_context in scene.iterate_states(times, size):
@@ -195,7 +191,8 @@ def _render(
             view.fixedcamid = model.camera(camera.name).id
             scene.update_view(data, gl_scene, view)
             window = mj.MjrRect(0, 0, camera.width, camera.height)
-            colours, codes = np.zeros((2, camera.height, camera.width, 3), np.uint8)
+            colours = np.zeros((camera.height, camera.width, 3), np.uint8)
+            codes = np.zeros_like(colours)
             depth = np.zeros(colours.shape[:2], np.float32)
             mj.mjr_render(window, gl_scene, gl_context)
             mj.mjr_readPixels(colours, depth, window, gl_context)
@@ -203,15 +200,21 @@ def _render(
             mj.mjr_render(window, gl_scene, gl_context)
             mj.mjr_readPixels(codes, None, window, gl_context)
             gl_scene.flags[flags] = 0
-            distances, geoms = _to_millimetres(depth, near, far), _decode_geoms(gl_scene, codes)
-            yield camera.name, (colours[::-1], distances[::-1], geoms[::-1])
+            distances = _to_millimetres(depth, near, far)
+            geoms = _decode_geoms(gl_scene, codes)
+            # OpenGL's first row is the lowest one.
+            yield camera.name, colours[::-1], distances[::-1], geoms[::-1]
 
 
 def _to_millimetres(depth: Any, near: float, far: float) -> NDArray[np.generic]:
-    """Return distances [mm] from OpenGL's depth, which is 0 at `near` and 1 at `far` [m]."""
+    """Return distances [mm] from OpenGL's depth, which is 0 at `near` and 1 at `far` [m].
+
+    The depth d of a distance z is (1 − near / z) / (1 − near / far).
+    """
     distances = near / (1.0 - np.asarray(depth, float) * (1.0 - near / far))
     whole = np.round(1000.0 * distances)
-    return np.where((depth >= 1.0) | (whole > _MAX_DEPTH), 0.0, whole).astype(np.uint16)
+    is_empty = (depth >= 1.0) | (whole > _MAX_DEPTH)
+    return np.where(is_empty, 0.0, whole).astype(np.uint16)
 
 
 def _decode_geoms(scene: Any, codes: Any) -> NDArray[np.generic]:
@@ -219,16 +222,19 @@ def _decode_geoms(scene: Any, codes: Any) -> NDArray[np.generic]:
     visible_geoms = np.zeros(scene.ngeom + 1, np.intp)
     for geom in scene.geoms[: scene.ngeom]:
         visible_geoms[geom.segid + 1] = geom.objid + 1
-    code = codes[..., 0] + 256 * codes[..., 1].astype(int) + 65_536 * codes[..., 2].astype(int)
-    return visible_geoms[code]
+    red = codes[..., 0]
+    green = codes[..., 1].astype(int)
+    blue = codes[..., 2].astype(int)
+    return visible_geoms[red + 256 * green + 65_536 * blue]
 
 
 def _number_segments(scene: RenderedScene) -> tuple[tuple[str, ...], NDArray[np.generic]]:
     """Return the names of visible bodies, and for one plus each geom the index of its name."""
-    names, numbers = [""], np.zeros(scene.model.ngeom + 1, np.uint16)
+    names = [""]
+    numbers = np.zeros(scene.model.ngeom + 1, np.uint16)
     for geom, label, is_robot in scene.visible_geoms:
-        label = ROBOT if is_robot else label
-        if label not in names:
-            names.append(label)
-        numbers[geom + 1] = names.index(label)
+        name = ROBOT if is_robot else label
+        if name not in names:
+            names.append(name)
+        numbers[geom + 1] = names.index(name)
     return tuple(names), numbers

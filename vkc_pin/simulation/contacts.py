@@ -32,7 +32,8 @@ from vkc_pin.world.trajectory.world_model import World
 # [m] Links that are planned to be closer may touch: some descriptions put cups a millimetre above
 # tables.
 _TOUCHING = 2e-3
-_GROUPS = 31  # usable bits of MuJoCo's contact types
+# usable bits of MuJoCo's contact types
+_GROUPS = 31
 
 
 @dataclass(frozen=True)
@@ -86,62 +87,84 @@ class Pairs:
 
 def find_contact_pairs(world: World, holds: Iterable[Hold]) -> Pairs:
     """Return the pairs of shapes that may touch."""
-    labels, joints = world.collision_labels, [shape.parentJoint for shape in world.shapes]
-    pairs = np.array(
-        [pair for pair in _iterate_planner_pairs(world) if joints[pair[0]] or joints[pair[1]]], int
-    ).reshape(-1, 2)
-    exempt = {
-        pair
-        for one in find_clearance_exemptions(world.scene, Options().dist_safe)
-        for pair in one.find_shape_pairs(labels, world.collision_keys)
-        if one.margin < 0.0
-    }
-    excluded = np.array([(min(pair), max(pair)) in exempt for pair in pairs.tolist()], bool)
+    labels = world.collision_labels
+    joints = [shape.parentJoint for shape in world.shapes]
+    # Two shapes of which neither has a joint cannot move.
+    movable = [(i, j) for i, j in _iterate_planner_pairs(world) if joints[i] or joints[j]]
+    pairs = np.array(movable, int).reshape(-1, 2)
     named = [frozenset((labels[i], labels[j])) for i, j in pairs.tolist()]
-    placed = CollisionShapes(world).place(world.coordinates.q(world.start[None]))
-    near = np.flatnonzero(placed.compute_lower_bounds(np.zeros(len(pairs), int), pairs) < 0.0)
-    deep = near[placed.compute_distances(np.zeros(len(near), int), pairs[near]) < -CONTACT_DEPTH]
-    overlapping = {named[k] for k in deep.tolist() if not excluded[k]}
-    excluded[deep] = True
-    never = {named[k] for k in np.flatnonzero(excluded).tolist()}
-    types, affinities = np.zeros((2, len(labels)), int)
-    bits = dict[Hold, int]()
-    groups = dict[tuple[frozenset[str], str], int]()
+    exempt = _find_exempt_pairs(world)
+    is_excluded = np.array([(min(pair), max(pair)) in exempt for pair in pairs.tolist()], bool)
+    deep = _find_overlapping_pairs(world, pairs)
+    overlapping = {named[k] for k in deep.tolist() if not is_excluded[k]}
+    is_excluded[deep] = True
+    never = {named[k] for k in np.flatnonzero(is_excluded).tolist()}
+    types = np.zeros(len(labels), int)
+    affinities = np.zeros(len(labels), int)
+    bits: dict[Hold, int] = {}
+    groups: dict[tuple[frozenset[str], str], int] = {}  # bits of hands and links
     held_pairs = set[frozenset[str]]()
     for hold in holds:
         hands = frozenset(find_touch_links(world.scene, hold))
         link = find_grasped_link(world.scene, hold)
         own = {frozenset((hand, link)) for hand in hands}
-        bits[hold] = groups.get((hands, link), 0)
-        if (hands, link) not in groups and not own & never and len(groups) < _GROUPS:
-            bits[hold] = groups[hands, link] = 1 << len(groups)
-            types[[label in hands for label in labels]] |= bits[hold]
-            affinities[[label == link for label in labels]] |= bits[hold]
+        group = (hands, link)
+        if group not in groups and not own & never and len(groups) < _GROUPS:
+            bit = 1 << len(groups)
+            groups[group] = bit
+            types[[label in hands for label in labels]] |= bit
+            affinities[[label == link for label in labels]] |= bit
+        bits[hold] = groups.get(group, 0)
         held_pairs |= own
-    keep = [k for k, name in enumerate(named) if not excluded[k] and name not in held_pairs]
+    keep = [k for k, name in enumerate(named) if not is_excluded[k] and name not in held_pairs]
     links = tuple(sorted((min(name), max(name)) for name in overlapping))
     return Pairs(pairs[keep], types, affinities, bits, links)
 
 
+def _find_exempt_pairs(world: World) -> set[tuple[int, int]]:
+    """Return the pairs of shapes that the scene allows to overlap, the smaller number first."""
+    exempt = set[tuple[int, int]]()
+    for exemption in find_clearance_exemptions(world.scene, Options().dist_safe):
+        if exemption.margin < 0.0:
+            exempt.update(exemption.find_shape_pairs(world.collision_labels, world.collision_keys))
+    return exempt
+
+
+def _find_overlapping_pairs(world: World, pairs: Ints) -> Ints:
+    """Return the rows of pairs, shape (P, 2), whose shapes overlap at the start."""
+    placed = CollisionShapes(world).place(world.coordinates.q(world.start[None]))
+    lower_bounds = placed.compute_lower_bounds(np.zeros(len(pairs), int), pairs)
+    near = np.flatnonzero(lower_bounds < 0.0)
+    distances = placed.compute_distances(np.zeros(len(near), int), pairs[near])
+    return near[distances < -CONTACT_DEPTH]
+
+
 def _iterate_planner_pairs(world: World) -> Iterable[tuple[int, int]]:
     """Yield the pairs of shapes that the planner checks, moving or not."""
-    scene, labels = world.scene, world.collision_labels
-    robots, bodies = len(scene.robot.collision.geometryObjects), len(world.bodies.geometryObjects)
+    scene = world.scene
+    labels = world.collision_labels
+    robot_size = len(scene.robot.collision.geometryObjects)
+    body_count = len(world.bodies.geometryObjects)
     owners = [label.partition(".")[0] for label in labels]
-    free = {name for name, placed in scene.objects.items() if placed.object.free}
-    yield from ((pair.first, pair.second) for pair in scene.robot.collision.collisionPairs)
-    for i in range(bodies):
-        for j in range(max(i + 1, robots), len(labels)):
-            # Wheels stand on the floor, and fixed objects may reach into it.
-            is_floor = j >= bodies and labels[j] == FLOOR
-            if is_floor and not (
-                world.shapes[i].parentJoint > 1 if i < robots else owners[i] in free
-            ):
+    links = [label.partition(".")[2] for label in labels]
+    for pair in scene.robot.collision.collisionPairs:
+        yield pair.first, pair.second
+    for i in range(body_count):
+        # Wheels stand on the floor, and fixed objects may reach into it.
+        if i < robot_size:
+            clears_floor = world.shapes[i].parentJoint > 1
+        else:
+            clears_floor = scene.objects[owners[i]].object.free
+        for j in range(max(i + 1, robot_size), len(labels)):
+            is_floor = j >= body_count and labels[j] == FLOOR
+            if is_floor and not clears_floor:
                 continue
-            same = robots <= i and j < bodies and owners[i] == owners[j]
-            links = frozenset(labels[k].partition(".")[2] for k in (i, j))
-            if not same or links in scene.objects[owners[i]].object.own_pairs:
-                yield i, j
+            is_same_object = robot_size <= i and j < body_count and owners[i] == owners[j]
+            if is_same_object:
+                own_pairs = scene.objects[owners[i]].object.own_pairs
+                if frozenset((links[i], links[j])) not in own_pairs:
+                    continue
+            yield i, j
 
 
 def find_unplanned_contacts(
@@ -165,26 +188,26 @@ def find_unplanned_contacts(
     if not samples_by_pair:
         return ()
     world = World(scene)
-    placed = CollisionShapes(world).place(world.coordinates.q(world.compute_positions(trajectory)))
-    found = []
+    z = world.compute_positions(trajectory)
+    placed = CollisionShapes(world).place(world.coordinates.q(z))
+    labels = np.array(world.collision_labels)
+    found: list[Contact] = []
     for (first, second), samples in samples_by_pair.items():
-        ones, others = (
-            [k for k, label in enumerate(world.collision_labels) if label == one]
-            for one in (first, second)
-        )
-        together = np.zeros(0)
-        if ones and others:
-            pairs = np.array([(i, j) for i in ones for j in others])
+        first_shapes = np.flatnonzero(labels == first)
+        second_shapes = np.flatnonzero(labels == second)
+        planned = np.zeros(0)  # times at which the plan has them together [s]
+        if len(first_shapes) and len(second_shapes):
+            grid = np.meshgrid(first_shapes, second_shapes, indexing="ij")
+            pairs = np.stack(grid, axis=-1).reshape(-1, 2)
             _, distances = placed.find_nearest(np.sort(pairs, axis=1))
-            together = trajectory.times[distances < _TOUCHING]
-        moments = np.array(samples)
-        far = np.array(
-            [np.min(np.abs(together - t), initial=np.inf) > CONTACT_WINDOW for t in moments[:, 0]]
-        )
-        moments = moments[far]
-        if len(moments):
-            time, depth = moments[np.argmax(moments[:, 1])].tolist()
-            found.append(
-                Contact(first, second, time, float(moments[0, 0]), period * len(moments), depth)
-            )
+            planned = trajectory.times[distances < _TOUCHING]
+        contacts = np.array(samples)
+        gaps = [np.min(np.abs(planned - time), initial=np.inf) for time in contacts[:, 0]]
+        unplanned = contacts[np.array(gaps) > CONTACT_WINDOW]
+        if not len(unplanned):
+            continue
+        deepest_time, depth = unplanned[np.argmax(unplanned[:, 1])].tolist()
+        begin = float(unplanned[0, 0])
+        duration = period * len(unplanned)
+        found.append(Contact(first, second, deepest_time, begin, duration, depth))
     return tuple(sorted(found, key=lambda contact: contact.begin))

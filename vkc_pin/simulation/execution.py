@@ -32,17 +32,19 @@ from vkc_pin.simulation.servos import (
 )
 from vkc_pin.simulation.welds import Grips, Latches, find_hold_spans, find_latches
 from vkc_pin.utils.arguments import check_instance
-from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.scene.clearance_exemptions import CONTACT_DEPTH
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Step, as_steps
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
 GRASPS = ("weld", "friction")
 """Grasp models."""
-_FRICTION_STEP = 5e-4  # [s] longest time step with friction grasps; see `Builder`
+# [s] longest time step with friction grasps; see `Builder`
+_FRICTION_STEP = 5e-4
 # [s] Longest time step with welds. MuJoCo computes a weld's force without the implicit damping of
 # servos, which then is too large for light wrists: from 7 ms on, one with a load of 4 kg oscillates
 # by 0.07 rad.
@@ -50,13 +52,18 @@ _WELD_STEP = 5e-3
 # [s] between the closing of fingers on an object that is in the hand at the start, and the moment
 # when they carry it
 _CLOSED_TIME = 0.2
-_FRAME_PERIOD = 0.02  # [s] between recorded states
-_BALANCE_TIME = 0.5  # [s] in which servos settle under load: ten time constants of the slowest
-_BALANCED = 1e-8  # [m] or [rad] by which servos at rest still give way
+# [s] between recorded states
+_FRAME_PERIOD = 0.02
+# [s] in which servos settle under load: ten time constants of the slowest
+_BALANCE_TIME = 0.5
+# [m] or [rad] by which servos at rest still give way
+_BALANCED = 1e-8
 # After each round a hundredth of the deflection is left, of up to 0.05 rad; contacts may chatter.
 _BALANCE_ROUNDS = 8
-_CONTACT_PERIOD = 0.01  # [s] between two recordings of contacts
-_MAX_STEPS = 2_000_000  # time steps, of which each keeps a row: 1.1 h at 2 ms
+# [s] between two recordings of contacts
+_CONTACT_PERIOD = 0.01
+# time steps, of which each keeps a row: 1.1 h at 2 ms
+_MAX_STEPS = 2_000_000
 
 
 def simulate(
@@ -96,25 +103,7 @@ def simulate(
         )
     steps = as_steps(steps)
     executed_scene = scene if actual is None else check_instance(actual, Scene, "actual")
-    for name, placed in scene.objects.items():
-        if (
-            name not in executed_scene.objects
-            or executed_scene.objects[name].object.coordinates.names
-            != placed.object.coordinates.names
-        ):
-            raise InputError(
-                f"`actual` lacks the object '{name}' of the plan's scene",
-                field="actual",
-                expected=name,
-                got=", ".join(executed_scene.objects),
-            )
-    if executed_scene.robot.coordinates.names != scene.robot.coordinates.names:
-        raise InputError(
-            "`actual` has another robot",
-            field="actual",
-            expected=scene.robot.name,
-            got=executed_scene.robot.name,
-        )
+    _check_actual(scene, executed_scene)
     run = _Run(executed_scene, trajectory, physics, friction=grasp == "friction")
     # By default MuJoCo logs warnings to a file in the working directory; see `diverged`.
     mujoco.set_mju_user_warning(lambda text: None)
@@ -123,6 +112,27 @@ def simulate(
     finally:
         mujoco.set_mju_user_warning(None)
     return run.make_result(scene, steps)
+
+
+def _check_actual(scene: Scene, actual: Scene) -> None:
+    """Check that the scene of the execution has the robot and objects of the plan's scene."""
+    for name, placed in scene.objects.items():
+        joints = placed.object.coordinates.names
+        other = actual.objects.get(name)
+        if other is None or other.object.coordinates.names != joints:
+            raise InputError(
+                f"`actual` lacks the object '{name}' of the plan's scene",
+                field="actual",
+                expected=name,
+                got=", ".join(actual.objects),
+            )
+    if actual.robot.coordinates.names != scene.robot.coordinates.names:
+        raise InputError(
+            "`actual` has another robot",
+            field="actual",
+            expected=scene.robot.name,
+            got=actual.robot.name,
+        )
 
 
 @dataclass(eq=False)
@@ -142,41 +152,39 @@ class _Run:
     friction: bool = False
 
     def __post_init__(self) -> None:
-        schedule, friction_spans = find_hold_spans(self.scene, self.trajectory), list[Span]()
-        longest = _FRICTION_STEP if self.friction else _WELD_STEP if schedule else np.inf
-        if self.physics.timestep > longest:
-            self.physics = replace(self.physics, timestep=longest)
+        schedule = find_hold_spans(self.scene, self.trajectory)
+        all_holds = _list_holds(schedule)
+        self._limit_timestep(has_holds=bool(schedule))
         physics = self.physics
-        self.mj, self.tree = import_mujoco(), World(self.scene)
+        self.mj = import_mujoco()
+        self.tree = World(self.scene)
         self.notes = complete_inertias(self.tree, physics)
-        holds: list[Hold] = list(dict.fromkeys(hold for hold, _, _ in schedule))
+        friction_spans: list[Span] = []
         if self.friction:
-            _, friction_spans = split_spans(schedule, float(self.trajectory.times[0]))
-            waits = find_grip_changes(self.trajectory, friction_spans)
-            self.trajectory = insert_pauses(self.trajectory, waits, physics.grip_time)
+            self._insert_grip_pauses(schedule)
             schedule, friction_spans = split_spans(
                 find_hold_spans(self.scene, self.trajectory), float(self.trajectory.times[0])
             )
-        trajectory, welded = self.trajectory, list(dict.fromkeys(hold for hold, _, _ in schedule))
+        trajectory = self.trajectory
+        welded = _list_holds(schedule)
+        friction_holds = [hold for hold, _, _ in friction_spans]
         self.planned = self.tree.compute_positions(trajectory)
         self.servos: tuple[Servo, ...] = make_servos(self.tree, self.planned, physics)
         self.fingers = find_fingers(self.tree, physics) if friction_spans else None
         if self.fingers is not None:
             self.servos = limit_finger_servos(self.servos, self.fingers, self.tree, physics)
-        friction_holds = [hold for hold, _, _ in friction_spans]
         self.pairs: Pairs = find_contact_pairs(
-            self.tree, [hold for hold in holds if hold not in friction_holds]
+            self.tree, [hold for hold in all_holds if hold not in friction_holds]
         )
         latches = find_latches(self.scene)
-        latch_equalities = [(joint, at) for joint, at, _, _ in latches]
         builder = Builder(self.tree, physics, has_friction_grasps=bool(friction_spans))
-        callbacks = (
-            {}
-            if self.fingers is None
-            else {"add_bodies": self.fingers.add_bodies, "add_extras": self.fingers.add_drives}
-        )
         self.physical: PhysicalWorld = builder.build(
-            self.pairs, self.servos, welded, latch_equalities, **callbacks
+            self.pairs,
+            self.servos,
+            welded,
+            [(joint, at) for joint, at, _, _ in latches],
+            add_bodies=None if self.fingers is None else self.fingers.add_bodies,
+            add_extras=None if self.fingers is None else self.fingers.add_drives,
         )
         self.grips = Grips(
             self.physical,
@@ -193,93 +201,136 @@ class _Run:
             self.squeezes = Squeezes(
                 self.physical, self.fingers, friction_spans, trajectory, physics, _CONTACT_PERIOD
             )
-        settle = physics.settle
-        if self.scene.holds and friction_spans:
-            settle = max(settle, physics.grip_time + _CLOSED_TIME)
-        start = float(trajectory.times[0]) - settle
-        end = float(trajectory.times[-1]) + physics.settle
-        count = (end - start) / physics.timestep
+        self.times: Floats = self._choose_times(has_friction_grasps=bool(friction_spans))
+        self.diverged: float | None = None
+        self.contact_samples: dict[tuple[str, str], list[tuple[float, float]]] = {}
+
+    def _limit_timestep(self, *, has_holds: bool) -> None:
+        """Shorten the time step if grasps require it."""
+        if self.friction:
+            longest = _FRICTION_STEP
+        elif has_holds:
+            longest = _WELD_STEP
+        else:
+            longest = np.inf
+        if self.physics.timestep > longest:
+            self.physics = replace(self.physics, timestep=longest)
+
+    def _insert_grip_pauses(self, schedule: Sequence[Span]) -> None:
+        """Let the robot wait where the hand closes or opens in grasps by friction."""
+        _, friction_spans = split_spans(schedule, float(self.trajectory.times[0]))
+        waypoints = find_grip_changes(self.trajectory, friction_spans)
+        self.trajectory = insert_pauses(self.trajectory, waypoints, self.physics.grip_time)
+
+    def _choose_times(self, *, has_friction_grasps: bool) -> Floats:
+        """Return the times of all steps, on the plan's clock, shape (steps,) [s]."""
+        timestep = self.physics.timestep
+        settle = self.physics.settle
+        if self.scene.holds and has_friction_grasps:
+            settle = max(settle, self.physics.grip_time + _CLOSED_TIME)
+        start = float(self.trajectory.times[0]) - settle
+        end = float(self.trajectory.times[-1]) + self.physics.settle
+        count = (end - start) / timestep
         if count > _MAX_STEPS:
             raise InputError(
                 "the motion takes too many time steps",
                 field="trajectory",
-                expected=f"at most {_MAX_STEPS * physics.timestep:g} s, with those of `settle`",
+                expected=f"at most {_MAX_STEPS * timestep:g} s, with those of `settle`",
                 got=f"{end - start:.6g} s",
             )
         steps = np.arange(int(np.ceil(count - 1e-9)) + 1)
-        self.times: Floats = np.asarray(start + physics.timestep * steps, float)
-        self.diverged: float | None = None
-        self.contact_samples: dict[tuple[str, str], list[tuple[float, float]]] = {}
+        return np.asarray(start + timestep * steps, float)
 
     def execute(self) -> None:
         """Run the simulation."""
-        mj, model, physics = self.mj, self.physical.model, self.physics
+        mj = self.mj
+        model = self.physical.model
+        servo_count = len(self.servos)
+        driven = self.physical.columns[:servo_count]
+        dofs = self.physical.dofs[:servo_count]
         data = mj.MjData(model)
         data.qpos[:] = self.physical.to_qpos(self.tree.start)
         mj.mj_forward(model, data)
         targets, commands = self._sample_commands()
-        if self.squeezes is not None and self.fingers is not None:
-            finger_columns, finger_motors = self.fingers.find_addresses(self.physical)
-            open_fingers = (
-                targets[:, self.trajectory.robot_size :]
-                if self.fingers.sides is None
-                else np.zeros((len(self.times), len(finger_columns)))
-            )
-            squeeze = self.squeezes.compute_commands(self.times, open_fingers)
-        driven, dofs = (
-            where[: len(self.servos)] for where in (self.physical.columns, self.physical.dofs)
-        )
+        finger_motors, finger_commands = self._compute_finger_commands(targets)
         self.grips.follow(data, float(self.times[0]))
         self.latches.follow(data)
-        data.ctrl[: len(self.servos)] = commands[0]
-        if self.squeezes is not None:
-            data.ctrl[finger_motors] = squeeze[0]
+        data.ctrl[:servo_count] = commands[0]
+        data.ctrl[finger_motors] = finger_commands[0]
         commands += self._balance_load(data)
         labels = np.zeros(model.ngeom, int)
         labels[self.physical.geoms] = np.arange(len(self.physical.geoms))
-        contact_steps, frame_steps = (
-            max(1, round(span / physics.timestep)) for span in (_CONTACT_PERIOD, _FRAME_PERIOD)
-        )
-        self.errors, self.efforts = np.zeros((2, len(self.times), len(self.servos)))
-        recorded = [
-            k for k in range(len(self.times)) if k % frame_steps == 0 or k == len(self.times) - 1
-        ]
-        self.clocks, records = self.times[recorded], list[Floats]()
+        contact_steps = max(1, round(_CONTACT_PERIOD / self.physics.timestep))
+        recorded = self._choose_recorded_steps()
+        records: list[Floats] = []
+        self.clocks = self.times[recorded]
+        self.errors = np.zeros((len(self.times), servo_count))
+        self.efforts = np.zeros((len(self.times), servo_count))
         for k, clock in enumerate(self.times.tolist()):
             self.grips.follow(data, clock)
             self.latches.follow(data)
             if k == recorded[len(records)]:
                 records.append(np.array(data.qpos))
             self.errors[k] = targets[k] - data.qpos[driven]
-            data.ctrl[: len(self.servos)] = commands[k]
-            if self.squeezes is not None:
-                data.ctrl[finger_motors] = squeeze[k]
+            data.ctrl[:servo_count] = commands[k]
+            data.ctrl[finger_motors] = finger_commands[k]
             mj.mj_step(model, data)
             self.efforts[k] = data.qfrc_actuator[dofs]
             # MuJoCo resets a state that diverged; it has no welds then.
             if self._has_diverged(data):
-                self.diverged, end = clock, k + 1
-                self.times, self.errors = self.times[:end], self.errors[:end]
-                self.efforts = self.efforts[:end]
+                self.diverged = clock
+                self._truncate(k + 1)
                 break
             self.grips.measure(data, clock)
-            if k % contact_steps == 0 and data.ncon:
-                self._record_contacts(data, labels, clock)
-            if k % contact_steps == 0 and self.squeezes is not None:
-                self.squeezes.measure(data, clock)
+            if k % contact_steps == 0:
+                if data.ncon:
+                    self._record_contacts(data, labels, clock)
+                if self.squeezes is not None:
+                    self.squeezes.measure(data, clock)
         # After a divergence the last state is repeated.
-        records += [records[-1]] * (len(recorded) - len(records))
+        missing = len(recorded) - len(records)
+        records += [records[-1]] * missing
         self.states: Floats = np.array(records)
+
+    def _choose_recorded_steps(self) -> list[int]:
+        """Return the steps whose states are recorded: one in each period, and the last one."""
+        frame_steps = max(1, round(_FRAME_PERIOD / self.physics.timestep))
+        last = len(self.times) - 1
+        recorded = list(range(0, len(self.times), frame_steps))
+        if recorded[-1] != last:
+            recorded.append(last)
+        return recorded
+
+    def _truncate(self, count: int) -> None:
+        """Forget all steps after the first `count`."""
+        self.times = self.times[:count]
+        self.errors = self.errors[:count]
+        self.efforts = self.efforts[:count]
+
+    def _compute_finger_commands(self, targets: Floats) -> tuple[Ints, Floats]:
+        """Return the motors of fingers that grasp by friction, (k,), and commands, (steps, k)."""
+        if self.squeezes is None or self.fingers is None:
+            return np.zeros(0, int), np.zeros((len(self.times), 0))
+        columns, motors = self.fingers.find_addresses(self.physical)
+        if self.fingers.sides is None:
+            planned = targets[:, self.trajectory.robot_size :]
+        else:
+            planned = np.zeros((len(self.times), len(columns)))
+        return motors, self.squeezes.compute_commands(self.times, planned)
 
     def _sample_commands(self) -> tuple[Floats, Floats]:
         """Return planned positions and commands of all servos, shape (steps, servos) each."""
         motion = sample_reference(self.trajectory, self.times)
+        positions, velocities, _ = motion
         fingers = sample_fingers(self.tree, self.planned, self.trajectory.times, self.times)
-        targets = np.column_stack([motion[0], fingers])
+        targets = np.column_stack([positions, fingers])
+        # The servo subtracts damping · (actual velocity), so that the command adds the planned one.
         feedforward = compute_feedforward(self.tree, self.servos, targets, motion)
-        count = motion[1].shape[1]
-        feedforward[:, :count] += motion[1] * [servo.damping for servo in self.servos[:count]]
-        return targets, targets + feedforward / [servo.stiffness for servo in self.servos]
+        count = velocities.shape[1]
+        damping = [servo.damping for servo in self.servos[:count]]
+        feedforward[:, :count] += velocities * damping
+        stiffness = [servo.stiffness for servo in self.servos]
+        return targets, targets + feedforward / stiffness
 
     def _has_diverged(self, data: Any) -> bool:
         """Return whether the integration has diverged."""
@@ -307,16 +358,20 @@ class _Run:
         displacement = np.zeros(len(self.servos))
         if not self.grips.has_active:
             return displacement
-        mj, model, count = self.mj, self.physical.model, len(self.servos)
+        mj = self.mj
+        model = self.physical.model
+        count = len(self.servos)
         driven = self.physical.columns[:count]
         largest = np.array([servo.limit / servo.stiffness for servo in self.servos])
         largest[self.trajectory.robot_size :] = 0.0
-        start, commands = data.qpos[driven].copy(), data.ctrl[:count].copy()
+        start = data.qpos[driven].copy()
+        commands = data.ctrl[:count].copy()
+        step_count = round(_BALANCE_TIME / self.physics.timestep)
         for _ in range(_BALANCE_ROUNDS):
             settled = mj.MjData(model)
             mj.mj_copyData(settled, model, data)
             settled.ctrl[:count] = commands + displacement
-            mj.mj_step(model, settled, nstep=round(_BALANCE_TIME / self.physics.timestep))
+            mj.mj_step(model, settled, nstep=step_count)
             if self._has_diverged(settled):
                 return displacement  # the execution diverges as well, and says so
             mj.mj_kinematics(model, settled)
@@ -329,13 +384,14 @@ class _Run:
 
     def _record_contacts(self, data: Any, labels: Any, clock: float) -> None:
         """Record the deepest penetration of each pair of links that touch."""
-        names, contacts = self.tree.collision_labels, data.contact
-        depths = -np.asarray(contacts.dist)
-        allowed = set() if self.squeezes is None else self.squeezes.allowed_contacts(clock)
+        names = self.tree.collision_labels
+        depths = -np.asarray(data.contact.dist)
+        geoms = np.asarray(data.contact.geom)
+        allowed = set() if self.squeezes is None else self.squeezes.list_allowed_contacts(clock)
         deepest: dict[tuple[str, str], float] = {}
         for i in np.flatnonzero(depths > CONTACT_DEPTH).tolist():
-            one, other = (names[labels[geom]] for geom in np.asarray(contacts.geom)[i])
-            pair = (min(one, other), max(one, other))
+            first, second = (names[labels[geom]] for geom in geoms[i])
+            pair = (min(first, second), max(first, second))
             if pair in allowed:
                 continue
             deepest[pair] = max(deepest.get(pair, 0.0), float(depths[i]))
@@ -358,7 +414,8 @@ class _Run:
         grips = [
             grip for grip in self.grips.grips if grip.end > grip.begin or grip.broken is not None
         ]
-        grips += [] if self.squeezes is None else self.squeezes.grips
+        if self.squeezes is not None:
+            grips += self.squeezes.grips
         executed = self._make_trajectory(rows)
         misses = measure_goal_errors(scene, steps, self.trajectory, self.tree, executed.times, rows)
         return SimulationResult(
@@ -380,20 +437,25 @@ class _Run:
 
     def _make_trajectory(self, rows: Floats) -> Trajectory:
         """Return the executed motion in the plan's coordinates."""
-        names, own = self.trajectory.names, self.tree.coordinates.names
-        positions = self.trajectory.at(self.clocks)
-        for column, name in enumerate(names):
-            if name in own:
-                positions[:, column] = rows[:, own.index(name)]
-        ends = np.searchsorted(
-            self.clocks, [self.trajectory.times[phase.last] for phase in self.trajectory.phases]
-        )
-        last, before, phases = len(self.clocks) - 1, 0, []
-        for number, (phase, end) in enumerate(
-            zip(self.trajectory.phases, ends.tolist(), strict=True)
-        ):
-            left = len(self.trajectory.phases) - 1 - number
-            end = last if left == 0 else min(max(end, before + 1), last - left)
+        planned = self.trajectory
+        world_names = self.tree.coordinates.names
+        positions = planned.at(self.clocks)
+        for column, name in enumerate(planned.names):
+            if name in world_names:
+                positions[:, column] = rows[:, world_names.index(name)]
+        last = len(self.clocks) - 1
+        phases: list[PhaseSpan] = []
+        before = 0  # the end of the phase before
+        for number, phase in enumerate(planned.phases):
+            end = int(np.searchsorted(self.clocks, planned.times[phase.last]))
+            # Each phase has at least one interval between recorded states.
+            remaining = len(planned.phases) - 1 - number
+            end = last if remaining == 0 else min(max(end, before + 1), last - remaining)
             phases.append(replace(phase, first=before, last=end))
             before = end
-        return Trajectory(names, self.clocks, positions, tuple(phases), self.trajectory.robot_size)
+        return Trajectory(planned.names, self.clocks, positions, tuple(phases), planned.robot_size)
+
+
+def _list_holds(spans: Sequence[Span]) -> list[Hold]:
+    """Return the holds of spans without repetition."""
+    return list(dict.fromkeys(hold for hold, _, _ in spans))

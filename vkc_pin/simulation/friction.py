@@ -21,7 +21,7 @@ from vkc_pin.simulation.physics import Physics, import_mujoco
 from vkc_pin.simulation.servos import Servo, make_servo
 from vkc_pin.simulation.welds import Grip, compute_planned_freedoms, measure_hand
 from vkc_pin.utils.arrays import Bools, Floats, Ints
-from vkc_pin.world.models.gripper import check_bar_fits, find_widest_bar
+from vkc_pin.world.models.gripper import PlacedShape, check_bar_fits, find_widest_bar
 from vkc_pin.world.models.shapes import triangulate
 from vkc_pin.world.scene.contact_rules import find_grasped_link, find_touch_links
 from vkc_pin.world.scene.hold import Hold
@@ -29,17 +29,24 @@ from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
-_MASS = 0.1  # [kg] of a sliding finger
-_REACH = 0.2  # [m] largest distance of a finger's shapes from the tool frame
-_COUPLING = (0.004, 1.0)  # time constant [s] and damping ratio of the coupling of fingers
+# [kg], [kg·m²] of a sliding finger
+_MASS = 0.1
+_INERTIA = 1e-4
+# [m] largest distance of a finger's shapes from the tool frame
+_REACH = 0.2
+# time constant [s] and damping ratio of the coupling of fingers
+_COUPLING = (0.004, 1.0)
 Span = tuple[Hold, float, float]
 """A hold with its begin and end [s]."""
 # Fingers are commanded this fraction of their travel beyond the closed position, so that thin
 # objects are pressed too.
 _OVERTRAVEL = 0.15
-_LOST_TIME = 0.1  # [s] without contact after which the object counts as lost
-_AVERAGED_SAMPLES = 2  # number of samples over which forces are averaged
-_REST = 1e-6  # [m/s] or [rad/s] up to which the robot is at rest
+# [s] without contact after which the object counts as lost
+_LOST_TIME = 0.1
+# number of samples over which forces are averaged
+_AVERAGED_SAMPLES = 2
+# [m/s] or [rad/s] up to which the robot is at rest
+_REST = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,41 +89,55 @@ class Fingers:
         """Add the bodies of sliding sides, to which their shapes move."""
         if self.sides is None:
             return
-        hand, kinds = builder.bodies[self.sides.joint], builder.mj.mjtJoint
-        for name, servo, sign, shapes in zip(
-            self.names, self.servos, (1.0, -1.0), self.sides.shapes, strict=True
-        ):
-            tool = self.sides.tool
+        mj = builder.mj
+        tool = self.sides.tool
+        hand = builder.bodies[self.sides.joint]
+        # The first side is on the positive x axis of the tool frame; both move towards x = 0.
+        sides = zip(self.names, self.servos, (-1.0, 1.0), self.sides.shapes, strict=True)
+        for name, servo, direction, shapes in sides:
             body = hand.add_body(
                 name=name, pos=tool.translation, quat=to_mujoco_quaternion(tool), gravcomp=1.0
             )
-            body.mass, body.inertia, body.explicitinertial = _MASS, np.full(3, 1e-4), True
-            joint = body.add_joint(name=name, type=kinds.mjJNT_SLIDE, axis=[-sign, 0.0, 0.0])
-            servo.configure_joint(joint, builder.mj)
-            limited = builder.mj.mjtLimited.mjLIMITED_TRUE
-            joint.limited, joint.range = limited, [0.0, self.sides.travel]
+            body.mass = _MASS
+            body.inertia = np.full(3, _INERTIA)
+            body.explicitinertial = True
+            joint = body.add_joint(
+                name=name, type=mj.mjtJoint.mjJNT_SLIDE, axis=[direction, 0.0, 0.0]
+            )
+            servo.configure_joint(joint, mj)
+            joint.limited = mj.mjtLimited.mjLIMITED_TRUE
+            joint.range = [0.0, self.sides.travel]
             for number in shapes:
                 place = tool.actInv(builder.world.shapes[number].placement)
-                builder.moved_shapes[number] = body, place
+                builder.moved_shapes[number] = (body, place)
 
     def add_drives(self, builder: Builder) -> None:
-        """Add the motors of sliding sides and the coupling of all fingers."""
+        """Add the motors of sliding sides and the coupling of all fingers.
+
+        Finger k follows the first one linearly: x_k = open_k + slope (x_0 − open_0).
+        """
+        mj = builder.mj
         for servo in self.servos:
-            servo.add_to(builder.spec, builder.mj)
-        kind, of = builder.mj.mjtEq.mjEQ_JOINT, builder.mj.mjtObj.mjOBJ_JOINT
+            servo.add_to(builder.spec, mj)
+        first_travel = self.closed[0] - self.open[0]
         for k in range(1, len(self.names)):
-            slope = (self.closed[k] - self.open[k]) / (self.closed[0] - self.open[0])
-            couple = builder.spec.add_equality(
-                type=kind, objtype=of, name1=self.names[k], name2=self.names[0], active=True
+            slope = (self.closed[k] - self.open[k]) / first_travel
+            coupling = builder.spec.add_equality(
+                type=mj.mjtEq.mjEQ_JOINT,
+                objtype=mj.mjtObj.mjOBJ_JOINT,
+                name1=self.names[k],
+                name2=self.names[0],
+                active=True,
             )
-            couple.data[:2] = [self.open[k] - slope * self.open[0], slope]
-            couple.solref = _COUPLING
+            coupling.data[:2] = [self.open[k] - slope * self.open[0], slope]
+            coupling.solref = _COUPLING
 
     def find_addresses(self, physical: PhysicalWorld) -> tuple[Ints, Ints]:
         """Return the indices of positions and of commands in MuJoCo, shape (k,) each."""
         model: Any = physical.model
         columns = [int(model.joint(name).qposadr[0]) for name in self.names]
-        return np.array(columns), np.array([int(model.actuator(name).id) for name in self.names])
+        motors = [int(model.actuator(name).id) for name in self.names]
+        return np.array(columns), np.array(motors)
 
 
 def find_fingers(world: World, physics: Physics) -> Fingers:
@@ -126,11 +147,18 @@ def find_fingers(world: World, physics: Physics) -> Fingers:
         return Fingers(gripper.names, gripper.closed, gripper.open)
     sides = _find_sides(world)
     names = ("side 0", "side 1")
-    bandwidth, ratio = physics.arm_bandwidth, physics.damping_ratio
-    servos = tuple(
-        make_servo(name, _MASS, physics.closing_force, "m", bandwidth, ratio) for name in names
-    )
-    return Fingers(names, np.full(2, sides.travel), np.zeros(2), sides, servos)
+    servos = [
+        make_servo(
+            name,
+            _MASS,
+            physics.closing_force,
+            "m",
+            physics.arm_bandwidth,
+            physics.damping_ratio,
+        )
+        for name in names
+    ]
+    return Fingers(names, np.full(2, sides.travel), np.zeros(2), sides, tuple(servos))
 
 
 def limit_finger_servos(
@@ -138,46 +166,54 @@ def limit_finger_servos(
 ) -> tuple[Servo, ...]:
     """Return the servos, those of fingers limited to the hand's closing force."""
     units = dict(zip(world.coordinates.names, world.coordinates.units, strict=True))
-    limited = []
+    limited: list[Servo] = []
     for servo in servos:
         name = servo.coordinate
-        if name in fingers.names:
-            if units[name] == "m":
-                limit = min(servo.limit, physics.closing_force)
-            elif np.isfinite(servo.limit):
-                limit = servo.limit
-            else:
-                problem = (
-                    "a revolute finger without an effort limit in the URDF cannot hold by friction"
-                )
-                raise InputError(
-                    problem, field="grasp", expected='an effort limit, or grasp="weld"', got=name
-                )
-            moved, ratio = servo.inertia - servo.armature, physics.damping_ratio
-            servo = make_servo(name, moved, limit, units[name], physics.arm_bandwidth, ratio)
-        limited.append(servo)
+        if name not in fingers.names:
+            limited.append(servo)
+            continue
+        if units[name] == "m":
+            limit = min(servo.limit, physics.closing_force)
+        elif np.isfinite(servo.limit):
+            limit = servo.limit
+        else:
+            raise InputError(
+                "a revolute finger without an effort limit in the URDF cannot hold by friction",
+                field="grasp",
+                expected='an effort limit, or grasp="weld"',
+                got=name,
+            )
+        load_inertia = servo.inertia - servo.armature
+        finger_servo = make_servo(
+            name, load_inertia, limit, units[name], physics.arm_bandwidth, physics.damping_ratio
+        )
+        limited.append(finger_servo)
     return tuple(limited)
 
 
 def _find_sides(world: World) -> Sides:
     """Return the shapes of a hand on either side of its tool frame, and their travel."""
-    robot, labels = world.scene.robot, world.collision_labels
+    robot = world.scene.robot
+    labels = world.collision_labels
     frame = world.model.frames[world.model.getFrameId(robot.tool_frame)]
-    back, sides = frame.placement.inverse(), (list[int](), list[int]())
-    hand = [
-        (number, shape)
-        for number, shape in enumerate(world.bodies.geometryObjects)
-        if labels[number] in robot.touch_links and shape.parentJoint == frame.parentJoint
-    ]
-    for number, shape in hand:
-        place = back * shape.placement
+    to_tool = frame.placement.inverse()
+    placed: list[PlacedShape] = []  # the hand's shapes in the tool frame
+    positive: list[int] = []
+    negative: list[int] = []
+    for number, shape in enumerate(world.bodies.geometryObjects):
+        if labels[number] not in robot.touch_links or shape.parentJoint != frame.parentJoint:
+            continue
+        place = to_tool * shape.placement
+        placed.append((shape.geometry, place))
+        if check_bar_fits(2.0 * _REACH, [(shape.geometry, place)]):
+            continue  # the x axis does not intersect it near the tool frame
         x = _project_on_x(place, shape)
-        beside = x.min() > 0.0 or x.max() < 0.0
-        if beside and not check_bar_fits(2.0 * _REACH, [(shape.geometry, place)]):
-            sides[0 if x.min() > 0.0 else 1].append(number)
-    placed = [(shape.geometry, back * shape.placement) for _, shape in hand]
-    travel = find_widest_bar(placed) / 2.0 if all(sides) else 0.0
-    if not (all(sides) and 0.0 < travel < _REACH):
+        if x.min() > 0.0:
+            positive.append(number)
+        elif x.max() < 0.0:
+            negative.append(number)
+    travel = find_widest_bar(placed) / 2.0 if positive and negative else 0.0
+    if not 0.0 < travel < _REACH:
         expected = (
             "a robot.yaml with a `gripper`, "
             "or touch_links on both sides of the tool frame, along its x axis"
@@ -188,9 +224,8 @@ def _find_sides(world: World) -> Sides:
             expected=expected,
             got="friction",
         )
-    return Sides(
-        (tuple(sides[0]), tuple(sides[1])), frame.placement, int(frame.parentJoint), travel
-    )
+    shapes = (tuple(positive), tuple(negative))
+    return Sides(shapes, frame.placement, int(frame.parentJoint), travel)
 
 
 def _project_on_x(place: pin.SE3, shape: pin.GeometryObject) -> Floats:
@@ -201,12 +236,11 @@ def _project_on_x(place: pin.SE3, shape: pin.GeometryObject) -> Floats:
 
 def find_grip_changes(trajectory: Trajectory, spans: Sequence[Span]) -> list[int]:
     """Return the waypoints at which the hand closes or opens."""
-    moments = {time for _, begin, end in spans for time in (begin, end) if np.isfinite(time)}
-    return [
-        phase.first
-        for phase in trajectory.phases
-        if float(trajectory.times[phase.first]) in moments
-    ]
+    changes = set[float]()
+    for _, begin, end in spans:
+        changes.update((begin, end))
+    firsts = [phase.first for phase in trajectory.phases]
+    return [first for first in firsts if float(trajectory.times[first]) in changes]
 
 
 @dataclass(eq=False)
@@ -248,22 +282,34 @@ class Squeezes:
         physics: Physics,
         period: float,
     ) -> None:
-        self._physical, self._fingers = physical, fingers
-        self._physics, self._period, self._trajectory = physics, period, trajectory
+        self._physical = physical
+        self._fingers = fingers
+        self._physics = physics
+        self._period = period
+        self._trajectory = trajectory
         self._engine = import_mujoco()
-        first, last = float(trajectory.times[0]), float(trajectory.times[-1])
-        world, scene = physical.world, physical.world.scene
+        tree = physical.world.model
+        tool_frame = physical.world.scene.robot.tool_frame
+        self._tool = tree.frames[tree.getFrameId(tool_frame)]
         labels = np.full(physical.model.ngeom, "", object)
-        labels[physical.geoms] = world.collision_labels
-        self._squeezes = []
-        for hold, begin, end in spans:
-            hands, link = frozenset(find_touch_links(scene, hold)), find_grasped_link(scene, hold)
-            pairs = frozenset((min(hand, link), max(hand, link)) for hand in hands)
-            own, held = np.isin(labels, list(hands)), np.asarray(labels == link)
-            grip = Grip(str(hold), max(begin, first), min(end, last))
-            self._squeezes.append(_Squeeze(hold, begin, end, own, held, pairs, grip))
-        tree = world.model
-        self._tool = tree.frames[tree.getFrameId(scene.robot.tool_frame)]
+        labels[physical.geoms] = physical.world.collision_labels
+        self._squeezes = [self._make_squeeze(*span, labels) for span in spans]
+
+    def _make_squeeze(self, hold: Hold, begin: float, end: float, labels: Any) -> _Squeeze:
+        """Make a grasp from begin to end [s]; `labels` are those of the geoms, shape (geoms,)."""
+        scene = self._physical.world.scene
+        first, last = self._trajectory.times[[0, -1]].tolist()
+        hands = frozenset(find_touch_links(scene, hold))
+        link = find_grasped_link(scene, hold)
+        return _Squeeze(
+            hold,
+            begin,
+            end,
+            hand=np.isin(labels, list(hands)),
+            link=np.asarray(labels == link),
+            pairs=frozenset((min(hand, link), max(hand, link)) for hand in hands),
+            grip=Grip(str(hold), max(begin, first), min(end, last)),
+        )
 
     @property
     def grips(self) -> list[Grip]:
@@ -277,25 +323,24 @@ class Squeezes:
             times: Times, shape (K,) [s].
             planned: Planned finger positions, shape (K, k).
         """
-        shares, time = np.zeros(len(times)), self._physics.grip_time
+        grip_time = self._physics.grip_time
+        closing = np.zeros(len(times))  # 0 as planned, 1 closed
         for squeeze in self._squeezes:
             begin = max(squeeze.begin, float(times[0]))
-            end = max(squeeze.end, begin + time)
-            corners = [begin, begin + time, end, end + time]
-            shares = np.maximum(shares, np.interp(times, corners, [0.0, 1.0, 1.0, 0.0]))
+            end = max(squeeze.end, begin + grip_time)
+            corners = [begin, begin + grip_time, end, end + grip_time]
+            closing = np.maximum(closing, np.interp(times, corners, [0.0, 1.0, 1.0, 0.0]))
         fingers = self._fingers
         closed = fingers.closed + _OVERTRAVEL * (fingers.closed - fingers.open)
-        return np.asarray(planned + shares[:, None] * (closed - planned))
+        return np.asarray(planned + closing[:, None] * (closed - planned))
 
-    def allowed_contacts(self, clock: float) -> set[tuple[str, str]]:
+    def list_allowed_contacts(self, clock: float) -> set[tuple[str, str]]:
         """Return the label pairs that may touch at a time [s] because of a grasp."""
-        time = self._physics.grip_time
-        return {
-            pair
-            for one in self._squeezes
-            if one.begin <= clock <= one.end + time
-            for pair in one.pairs
-        }
+        allowed = set[tuple[str, str]]()
+        for squeeze in self._squeezes:
+            if squeeze.begin <= clock <= squeeze.end + self._physics.grip_time:
+                allowed |= squeeze.pairs
+        return allowed
 
     def measure(self, data: Any, clock: float) -> None:
         """Record the load and slip of each grasp."""
@@ -308,16 +353,26 @@ class Squeezes:
             if squeeze.place is None:
                 squeeze.place = place
                 self._measure_hand(data, squeeze, clock)
-            pull = self._compute_wrench(data, squeeze, tool)
-            squeeze.missing = 0 if pull is not None else squeeze.missing + 1
-            squeeze.forces.append(np.zeros(6) if pull is None else pull)
+            wrench = self._compute_wrench(data, squeeze, tool)
+            if wrench is None:
+                wrench = np.zeros(6)
+                squeeze.missing += 1
+            else:
+                squeeze.missing = 0
+            squeeze.forces.append(wrench)
             mean = np.mean(squeeze.forces, axis=0)
+            force = float(np.linalg.norm(mean[:3]))
+            torque = float(np.linalg.norm(mean[3:]))
+            slip = float(np.linalg.norm(place - squeeze.place))
+            is_lost = squeeze.missing * self._period >= _LOST_TIME
             grip = squeeze.grip
-            force = max(grip.force, float(np.linalg.norm(mean[:3])))
-            torque = max(grip.torque, float(np.linalg.norm(mean[3:])))
-            slip = max(grip.slip, float(np.linalg.norm(place - squeeze.place)))
-            lost_time = clock if squeeze.missing * self._period >= _LOST_TIME else None
-            squeeze.grip = replace(grip, force=force, torque=torque, slip=slip, broken=lost_time)
+            squeeze.grip = replace(
+                grip,
+                force=max(grip.force, force),
+                torque=max(grip.torque, torque),
+                slip=max(grip.slip, slip),
+                broken=clock if is_lost else None,
+            )
 
     def _measure_hand(self, data: Any, squeeze: _Squeeze, clock: float) -> None:
         """Record where the closed hand is at the attachment."""
@@ -328,29 +383,38 @@ class Squeezes:
 
     def _find_tool(self, data: Any, squeeze: _Squeeze) -> tuple[Floats, Floats]:
         """Return the tool's position in the world and in the grasped body's frame [m]."""
-        tool = int(self._physical.bodies[self._tool.parentJoint])
-        where = (
-            data.xpos[tool]
-            + np.asarray(data.xmat[tool]).reshape(3, 3) @ self._tool.placement.translation
-        )
-        body = int(self._physical.model.geom_bodyid[np.flatnonzero(squeeze.link)[0]])
-        turn = np.asarray(data.xmat[body]).reshape(3, 3)
-        return np.asarray(where), np.asarray(turn.T @ (where - data.xpos[body]))
+        hand = int(self._physical.bodies[self._tool.parentJoint])
+        hand_rotation = np.asarray(data.xmat[hand]).reshape(3, 3)
+        tool = data.xpos[hand] + hand_rotation @ self._tool.placement.translation
+        geom = np.flatnonzero(squeeze.link)[0]
+        body = int(self._physical.model.geom_bodyid[geom])
+        rotation = np.asarray(data.xmat[body]).reshape(3, 3)
+        return np.asarray(tool), np.asarray(rotation.T @ (tool - data.xpos[body]))
 
     def _compute_wrench(self, data: Any, squeeze: _Squeeze, tool: Floats) -> Floats | None:
-        """Return the hand's wrench on the grasped link at the tool's origin, shape (6,)."""
+        """Return the hand's wrench on the grasped link at the tool's origin, shape (6,).
+
+        Without a contact force it is None. MuJoCo states a contact's wrench on its second geom in
+        the contact's frame, whose axes are the rows of `frame`, the normal first.
+        """
         pairs = np.asarray(data.contact.geom).reshape(-1, 2)
-        ahead = squeeze.hand[pairs[:, 0]] & squeeze.link[pairs[:, 1]]
-        back = squeeze.link[pairs[:, 0]] & squeeze.hand[pairs[:, 1]]
-        total, pushed, wrench = np.zeros(6), False, np.zeros(6)
-        for i in np.flatnonzero(ahead | back).tolist():
+        first = pairs[:, 0]
+        second = pairs[:, 1]
+        is_hand_first = squeeze.hand[first] & squeeze.link[second]
+        is_link_first = squeeze.link[first] & squeeze.hand[second]
+        total = np.zeros(6)
+        wrench = np.zeros(6)
+        is_pushed = False
+        for i in np.flatnonzero(is_hand_first | is_link_first).tolist():
             self._engine.mj_contactForce(self._physical.model, data, i, wrench)
-            pushed |= bool(wrench[0] > 0.0)
+            is_pushed |= bool(wrench[0] > 0.0)
             axes = np.asarray(data.contact.frame[i]).reshape(3, 3)
-            force, torque = (1.0 if ahead[i] else -1.0) * (wrench.reshape(2, 3) @ axes)
+            sign = 1.0 if is_hand_first[i] else -1.0
+            force, torque = sign * (wrench.reshape(2, 3) @ axes)
+            lever = np.asarray(data.contact.pos[i]) - tool
             total[:3] += force
-            total[3:] += torque + np.cross(np.asarray(data.contact.pos[i]) - tool, force)
-        return total if pushed else None
+            total[3:] += torque + np.cross(lever, force)
+        return total if is_pushed else None
 
 
 def split_spans(spans: Sequence[Span], begin: float) -> tuple[list[Span], list[Span]]:
@@ -363,9 +427,17 @@ def split_spans(spans: Sequence[Span], begin: float) -> tuple[list[Span], list[S
         spans: All holds.
         begin: Begin of the trajectory [s].
     """
-    own = [span for span in spans if span[0].by is None]
-    others = [span for span in spans if span[0].by is not None]
-    return [*((hold, first, begin) for hold, first, _ in own if first < begin), *others], own
+    by_hand: list[Span] = []
+    by_objects: list[Span] = []
+    at_start: list[Span] = []
+    for hold, first, last in spans:
+        if hold.by is not None:
+            by_objects.append((hold, first, last))
+            continue
+        by_hand.append((hold, first, last))
+        if first < begin:
+            at_start.append((hold, first, begin))
+    return [*at_start, *by_objects], by_hand
 
 
 def insert_pauses(trajectory: Trajectory, waypoints: Iterable[int], seconds: float) -> Trajectory:
@@ -384,14 +456,14 @@ def insert_pauses(trajectory: Trajectory, waypoints: Iterable[int], seconds: flo
     curve = trajectory.curve
     if curve is not None:
         knots = np.searchsorted(curve.times, trajectory.times[at])
-        moving = np.abs(curve.rates[knots]).max(axis=1) > _REST
-        if moving.any():
-            got = f"moving at {trajectory.times[at[moving]][0]:.2f} s"
+        is_moving = np.abs(curve.rates[knots]).max(axis=1) > _REST
+        if is_moving.any():
+            time = trajectory.times[at[is_moving]][0]
             raise InputError(
                 "the hand closes or opens while the robot moves",
                 field="trajectory",
                 expected="a trajectory at rest",
-                got=got,
+                got=f"moving at {time:.2f} s",
             )
         rates = np.insert(curve.rates, knots + 1, 0.0, axis=0)
         rates[knots + np.arange(len(knots))] = 0.0
@@ -401,14 +473,15 @@ def insert_pauses(trajectory: Trajectory, waypoints: Iterable[int], seconds: flo
     def shift_index(waypoint: int) -> int:
         return waypoint + int(np.searchsorted(at, waypoint))
 
+    phases = [
+        replace(phase, first=shift_index(phase.first), last=shift_index(phase.last))
+        for phase in trajectory.phases
+    ]
     return replace(
         trajectory,
         times=_insert_delays(trajectory.times, at, seconds),
         positions=np.insert(trajectory.positions, at + 1, trajectory.positions[at], axis=0),
-        phases=tuple(
-            replace(phase, first=shift_index(phase.first), last=shift_index(phase.last))
-            for phase in trajectory.phases
-        ),
+        phases=tuple(phases),
         curve=curve,
     )
 
@@ -416,4 +489,5 @@ def insert_pauses(trajectory: Trajectory, waypoints: Iterable[int], seconds: flo
 def _insert_delays(times: Floats, at: Ints, seconds: float) -> Floats:
     """Return times with those at indices `at` doubled, `seconds` apart, and later ones delayed."""
     delays = seconds * np.searchsorted(at, np.arange(len(times)))
-    return np.asarray(np.insert(times + delays, at + 1, (times + delays)[at] + seconds))
+    delayed = times + delays
+    return np.asarray(np.insert(delayed, at + 1, delayed[at] + seconds))

@@ -36,8 +36,10 @@ from vkc_pin.world.trajectory.free_objects import FreeObjects
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
-_TOLERANCE = 2e-3  # [m] or [rad] within which a plan counts as having completed a step
-_LASTING = (Actuate, Place, Release)  # steps after which objects stay where they are
+# [m] or [rad] within which a plan counts as having completed a step
+_TOLERANCE = 2e-3
+# steps after which objects stay where they are
+_LASTING = (Actuate, Place, Release)
 
 
 @dataclass(frozen=True)
@@ -95,32 +97,37 @@ def measure_goal_errors(
         rows: World coordinates at these times, shape (K, n).
     """
     goals = _Goals(World(scene), world, trajectory)
-    completed, errors, last = 0, list[Miss](), len(goals.edges) - 1
+    last = len(goals.edges) - 1
+    misses: list[Miss] = []
 
     def find_row(edge: int) -> int:
-        at = float(trajectory.times[goals.edges[edge]])
-        return len(times) - 1 if edge == last else int(np.argmin(np.abs(times - at)))
+        if edge == last:
+            return len(times) - 1
+        time = float(trajectory.times[goals.edges[edge]])
+        return int(np.argmin(np.abs(times - time)))
 
-    for number, step in enumerate(steps):
+    def add_misses(number: int, row: int, errors: Errors) -> None:
+        for subject, amount, unit in errors:
+            misses.append(Miss(number, subject, amount, unit, float(times[row])))
+
+    completed = 0  # the edge at which the plan has completed the step
+    for number, step in enumerate(steps, start=1):
         before = completed
-        if number == len(steps) - 1:
+        if number == len(steps):
             completed = last
         while completed < last and not goals.is_completed(step, completed):
             completed += 1
-        edge = completed
+        measured = completed
         if isinstance(step, _LASTING):
-            while edge < last and goals.is_completed(step, edge + 1):
-                edge += 1
-        row = find_row(edge)
-        for subject, amount, unit in goals.compute_errors(step, completed, edge, rows[row]):
-            errors.append(Miss(number + 1, subject, amount, unit, float(times[row])))
+            while measured < last and goals.is_completed(step, measured + 1):
+                measured += 1
+        row = find_row(measured)
+        add_misses(number, row, goals.compute_errors(step, completed, measured, rows[row]))
         for name, support in goals.list_supported_objects(before, completed).items():
             edge = goals.find_rest(name, completed)
             row = find_row(edge)
-            found = goals.compute_support_errors(name, support, edge, rows[row])
-            for subject, amount, unit in found:
-                errors.append(Miss(number + 1, subject, amount, unit, float(times[row])))
-    return tuple(errors)
+            add_misses(number, row, goals.compute_support_errors(name, support, edge, rows[row]))
+    return tuple(misses)
 
 
 class _Goals:
@@ -136,7 +143,9 @@ class _Goals:
     """
 
     def __init__(self, planned: World, world: World, trajectory: Trajectory) -> None:
-        self.planned, self.world, self.trajectory = planned, world, trajectory
+        self.planned = planned
+        self.world = world
+        self.trajectory = trajectory
         self.edges = [0, *(phase.last for phase in trajectory.phases)]
         free = FreeObjects(planned.scene, trajectory)
         self.ends = planned.compute_positions(trajectory, trajectory.times[self.edges], free)
@@ -196,16 +205,18 @@ class _Goals:
             edge: Edge of the plan.
             row: World coordinates of the execution there, shape (n,).
         """
-        below = compute_placement(self.planned, self.ends[edge], support)
-        goal = below.actInv(self.planned.get_placement(name, self.ends[edge]))
-        real = compute_placement(self.world, row, support).actInv(
-            self.world.get_placement(name, row)
-        )
-        vertical = below.rotation[2]  # in the support's frame
-        cosine = (goal.rotation.T @ vertical) @ (real.rotation.T @ vertical)
+        planned_support = compute_placement(self.planned, self.ends[edge], support)
+        actual_support = compute_placement(self.world, row, support)
+        # The object's placements on its support.
+        planned = planned_support.actInv(self.planned.get_placement(name, self.ends[edge]))
+        actual = actual_support.actInv(self.world.get_placement(name, row))
+        shift = float(np.linalg.norm(actual.translation - planned.translation))
+        vertical = planned_support.rotation[2]  # in the support's frame
+        cosine = (planned.rotation.T @ vertical) @ (actual.rotation.T @ vertical)
+        tilt = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
         subject = f"{name} on {support}"
-        yield subject, float(np.linalg.norm(real.translation - goal.translation)), "m"
-        yield subject, float(np.arccos(np.clip(cosine, -1.0, 1.0))), "rad"
+        yield subject, shift, "m"
+        yield subject, tilt, "rad"
 
     def _get_holds_after(self, edge: int) -> Sequence[Hold]:
         """Return the holds of the phase that begins at an edge; at the end, those of the last."""
@@ -218,16 +229,20 @@ class _Goals:
         The plan holds the object after the edge, or the hand is at an attachment but lets go of it
         at once, so that no phase holds the object. A grasp that is held has the plan's deviation.
         """
-        item, planned = self.planned.scene.objects[step.object].object, self.ends[edge]
+        item = self.planned.scene.objects[step.object].object
+        planned = self.ends[edge]
         for hold in self._get_holds_after(edge):
             is_wanted = step.attachment in (None, hold.attachment) and step.by == hold.frame
-            if hold.object == step.object and is_wanted:
-                attachment = item.attachment(hold.attachment)
-                deviation = _measure_grasp(self.planned, step, attachment, planned)
-                is_planned = is_within_grasp(*compute_distances(deviation))
-                return apply_deviation(attachment, deviation.tolist()) if is_planned else attachment
+            if hold.object != step.object or not is_wanted:
+                continue
+            attachment = item.attachment(hold.attachment)
+            deviation = _measure_grasp(self.planned, step, attachment, planned)
+            if is_within_grasp(*compute_distances(deviation)):
+                return apply_deviation(attachment, deviation.tolist())
+            return attachment
         names = item.attachments if step.attachment is None else [step.attachment]
-        for attachment in (item.attachment(name) for name in names):
+        for name in names:
+            attachment = item.attachment(name)
             deviation = _measure_grasp(self.planned, step, attachment, planned)
             if max(compute_distances(deviation)) <= _TOLERANCE:
                 return attachment
@@ -252,15 +267,16 @@ class _Goals:
 
         Levers that release a latch may return.
         """
-        released, coordinates = self._find_released(step, completed), self.planned.coordinates
+        released = self._find_released(step, completed)
+        coordinates = self.planned.coordinates
         for name, placed in self.planned.scene.objects.items():
             if name not in released:
                 continue
             if placed.object.free:
-                goal = self.planned.get_placement(name, self.ends[edge])
-                off = goal.actInv(self.world.get_placement(name, row))
-                yield name, float(np.linalg.norm(off.translation)), "m"
-                yield name, float(np.linalg.norm(pin.log3(off.rotation))), "rad"
+                planned = self.planned.get_placement(name, self.ends[edge])
+                offset = planned.actInv(self.world.get_placement(name, row))
+                yield name, float(np.linalg.norm(offset.translation)), "m"
+                yield name, float(np.linalg.norm(pin.log3(offset.rotation))), "rad"
             levers = {latch.released_by for latch in placed.object.latches}
             for joint in placed.object.coordinates.names:
                 if joint not in levers:
@@ -268,12 +284,13 @@ class _Goals:
                     error = abs(float(row[column] - self.ends[edge][column]))
                     yield f"{name}.{joint}", error, coordinates.units[column]
 
-    def _find_released(self, step: Release, completed: int) -> Mapping[str, str]:
+    def _find_released(self, step: Release, completed: int) -> set[str]:
         """Return the objects that a step releases: those that were held last before."""
-        before = [self.planned.scene.held]
-        before += [phase.held for phase in self.trajectory.phases[:completed]]
-        held = next((held for held in reversed(before) if held), {})
-        return {name: held[name] for name in held if step.object in (None, name)}
+        held = self.planned.scene.held
+        for phase in self.trajectory.phases[:completed]:
+            if phase.held:
+                held = phase.held
+        return {name for name in held if step.object in (None, name)}
 
 
 def _measure_grasp(world: World, step: Grasp, attachment: Attachment, row: Floats) -> Floats:
@@ -296,7 +313,8 @@ def _compute_goal_errors(world: World, scene: Scene, step: Step, row: Floats) ->
         step: The step.
         row: World coordinates, shape (n,).
     """
-    names, units = world.coordinates.names, world.coordinates.units
+    names = world.coordinates.names
+    units = world.coordinates.units
     if isinstance(step, Actuate):
         for joint, goal in step.joints.items():
             column = names.index(f"{step.object}.{joint}")
@@ -327,20 +345,25 @@ def _compute_pose_errors(
     else:
         frame = step.frame or scene.robot.tool_frame
     goal: Any = step.target if isinstance(step, Touch) else step.pose
-    placement, has_pose = compute_placement(world, row, frame), isinstance(goal, pin.SE3)
+    placement = compute_placement(world, row, frame)
+    has_pose = isinstance(goal, pin.SE3)
     position = goal.translation if has_pose else np.asarray(goal)
     yield frame, float(np.linalg.norm(placement.translation - position)), "m"
     if has_pose:
-        yield frame, float(np.linalg.norm(pin.log3(goal.rotation.T @ placement.rotation))), "rad"
+        rotation = goal.rotation.T @ placement.rotation
+        yield frame, float(np.linalg.norm(pin.log3(rotation))), "rad"
     elif isinstance(step, Place):  # any heading, the same tilt as at the start
-        is_held = step.object in scene.held
-        at_start = scene.objects[step.object].placement.rotation[2]
-        vertical = np.array([0.0, 0.0, 1.0]) if is_held else at_start
-        yield frame, float(np.arccos(np.clip(placement.rotation[2] @ vertical, -1.0, 1.0))), "rad"
+        # the world's vertical axis in the object's frame
+        vertical = scene.objects[step.object].placement.rotation[2]
+        if step.object in scene.held:
+            vertical = np.array([0.0, 0.0, 1.0])
+        cosine = np.clip(placement.rotation[2] @ vertical, -1.0, 1.0)
+        yield frame, float(np.arccos(cosine)), "rad"
 
 
 def compute_placement(world: World, row: Floats, frame: str) -> pin.SE3:
     """Return the placement of a frame at configuration `row`."""
-    data = world.model.createData()
-    pin.forwardKinematics(world.model, data, world.coordinates.q(row))
-    return pin.updateFramePlacement(world.model, data, world.model.getFrameId(frame)).copy()
+    model = world.model
+    data = model.createData()
+    pin.forwardKinematics(model, data, world.coordinates.q(row))
+    return pin.updateFramePlacement(model, data, model.getFrameId(frame)).copy()

@@ -29,8 +29,10 @@ from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.trajectory.world_model import World
 
 # [kg], [kg·m²] of the body between hand and link of a grasp with degrees of freedom
-_CARRIER_MASS, _CARRIER_INERTIA = 0.05, 1e-4
-_CARRIER_DAMPING = 0.02  # of these degrees of freedom [N·m·s/rad] or [N·s/m]
+_CARRIER_MASS = 0.05
+_CARRIER_INERTIA = 1e-4
+# [N·m·s/rad] or [N·s/m] of these degrees of freedom
+_CARRIER_DAMPING = 0.02
 # Time constant [s] and damping ratio of contacts, twice as stiff as MuJoCo's defaults
 _CONTACT = (0.01, 1.0)
 # Iterations of MuJoCo's noslip solver. Without them a stick of 0.4 kg turns between the fingers by
@@ -44,6 +46,10 @@ _DISTANCE_TOLERANCE = 1e-12
 # 0.4 kg turns by 3 mrad in the hand under its weight, and more the thinner it is; with this, by
 # 6 µrad.
 _WELD_IMPEDANCE = 0.9999
+# Elements xx, yy, zz, xy, xz, yz of a matrix, MuJoCo's order of a full inertia.
+_INERTIA_ELEMENTS = ([0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2])
+# MuJoCo draws groups 0 to 2; collision shapes are hidden.
+_HIDDEN_GROUP = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,9 +84,8 @@ class PhysicalWorld:
         configuration[self.columns] = row
         for move in self.world.coordinates.followers:
             joint = self.model.body_jntadr[self.bodies[move.joint]]
-            configuration[self.model.jnt_qposadr[joint]] = (
-                move.factor * row[move.coordinate] + move.offset
-            )
+            value = move.factor * row[move.coordinate] + move.offset
+            configuration[self.model.jnt_qposadr[joint]] = value
         return configuration
 
     def from_qpos(self, qpos: Floats) -> Floats:
@@ -89,7 +94,8 @@ class PhysicalWorld:
 
     def place_body(self, data: Any, body: int) -> pin.SE3:
         """Return the placement of a body in the world."""
-        return pin.SE3(np.array(data.xmat[body]).reshape(3, 3), np.array(data.xpos[body]))
+        rotation = np.array(data.xmat[body]).reshape(3, 3)
+        return pin.SE3(rotation, np.array(data.xpos[body]))
 
     def place_frame(self, data: Any, frame: str) -> pin.SE3:
         """Return the placement of a frame of the tree in the world."""
@@ -137,15 +143,7 @@ class Builder:
         add_extras: Callable[[Builder], None] | None = None,
     ) -> PhysicalWorld:
         """Build the model."""
-        mj, spec, option = self.mj, self.spec, self.spec.option
-        option.timestep = self.physics.timestep
-        option.integrator = mj.mjtIntegrator.mjINT_IMPLICITFAST
-        # Objects that are grasped by friction hardly creep.
-        option.cone, option.impratio = mj.mjtCone.mjCONE_ELLIPTIC, 10.0
-        if self.has_friction_grasps:
-            option.noslip_iterations = _NOSLIP_ITERATIONS
-        option.ccd_tolerance = _DISTANCE_TOLERANCE
-        spec.compiler.degree = False
+        self._set_options()
         self._add_bodies(servos)
         if add_bodies is not None:
             add_bodies(self)
@@ -155,9 +153,8 @@ class Builder:
         for coordinate, value in latches:
             self._add_joint_equality(coordinate, value)
         if self.world.scene.robot.base == "fixed":
-            for coordinate, value in zip(
-                self.world.coordinates.names[:3], self.world.start[:3], strict=True
-            ):
+            base = zip(self.world.coordinates.names[:3], self.world.start[:3], strict=True)
+            for coordinate, value in base:
                 self._add_joint_equality(coordinate, float(value), active=True)
         for servo in servos:
             servo.add_to(self.spec, self.mj)
@@ -166,45 +163,68 @@ class Builder:
         if add_extras is not None:
             add_extras(self)
         try:
-            model = spec.compile()
+            model = self.spec.compile()
         except ValueError as error:
             raise InputError("MuJoCo rejects the scene", field="scene", got=str(error)) from error
-        bodies = np.array(
-            [0, *(int(model.body(f"body {j}").id) for j in range(1, self.world.model.njoints))]
-        )
-        geoms = np.array([int(model.geom(f"shape {k}").id) for k in range(len(self.world.shapes))])
-        columns = {
-            hold: np.array([model.joint(k).qposadr[0] for k in own], int)
-            for hold, own in self._carrier_joints.items()
-        }
+        return self._make_world(model)
+
+    def _set_options(self) -> None:
+        """Set the options of the solver."""
+        option = self.spec.option
+        option.timestep = self.physics.timestep
+        option.integrator = self.mj.mjtIntegrator.mjINT_IMPLICITFAST
+        # Objects that are grasped by friction hardly creep.
+        option.cone = self.mj.mjtCone.mjCONE_ELLIPTIC
+        option.impratio = 10.0
+        if self.has_friction_grasps:
+            option.noslip_iterations = _NOSLIP_ITERATIONS
+        option.ccd_tolerance = _DISTANCE_TOLERANCE
+        self.spec.compiler.degree = False
+
+    def _make_world(self, model: Any) -> PhysicalWorld:
+        """Find what the tree's joints, shapes and coordinates have become in a compiled model."""
+        joints = range(1, self.world.model.njoints)
+        bodies = [0, *(int(model.body(f"body {j}").id) for j in joints)]
+        geoms = [int(model.geom(f"shape {k}").id) for k in range(len(self.world.shapes))]
+        columns, dofs = self._find_addresses(model)
+        carriers: dict[Hold, Ints] = {}
+        for hold, names in self._carrier_joints.items():
+            carriers[hold] = np.array([model.joint(name).qposadr[0] for name in names], int)
         return PhysicalWorld(
-            self.world, model, bodies, geoms, *self._find_addresses(model), columns
+            world=self.world,
+            model=model,
+            bodies=np.array(bodies),
+            geoms=np.array(geoms),
+            columns=columns,
+            dofs=dofs,
+            carriers=carriers,
         )
 
     def _add_bodies(self, servos: Sequence[Servo]) -> None:
         """Add a body with its inertia for each joint of the tree."""
-        tree, driven = self.world.model, {servo.coordinate: servo for servo in servos}
+        tree = self.world.model
+        coordinates = self.world.coordinates
+        driven = {servo.coordinate: servo for servo in servos}
+        follows = {move.joint: move for move in coordinates.followers}
+        # The coordinates of each joint; a mimic joint has that of the joint that it follows.
+        names: dict[int, list[str]] = {}
+        for name, joint in zip(coordinates.names, coordinates.joints, strict=True):
+            names.setdefault(joint, []).append(name)
+        for joint, move in follows.items():
+            names[joint] = [coordinates.names[move.coordinate]]
         data = tree.createData()
         pin.forwardKinematics(tree, data, pin.neutral(tree))
         self.bodies = [self.spec.worldbody]
-        names: dict[int, list[str]] = {}
-        for name, joint in zip(
-            self.world.coordinates.names, self.world.coordinates.joints, strict=True
-        ):
-            names.setdefault(joint, []).append(name)
-        follows = {move.joint: move for move in self.world.coordinates.followers}
-        names |= {
-            joint: [self.world.coordinates.names[move.coordinate]]
-            for joint, move in follows.items()
-        }
         for j in range(1, tree.njoints):
             place = tree.jointPlacements[j]
             body = self.bodies[tree.parents[j]].add_body(
                 name=f"body {j}", pos=place.translation, quat=to_mujoco_quaternion(place)
             )
             inertia = tree.inertias[j]
-            body.mass, body.ipos, body.explicitinertial = inertia.mass, inertia.lever, True
-            body.fullinertia = np.asarray(inertia.inertia)[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
+            body.mass = inertia.mass
+            body.ipos = inertia.lever
+            body.explicitinertial = True
+            body.fullinertia = np.asarray(inertia.inertia)[_INERTIA_ELEMENTS]
             # Arm controllers compensate gravity.
             body.gravcomp = float(names[j][0] in driven or self._is_balanced(j))
             self.bodies.append(body)
@@ -222,52 +242,72 @@ class Builder:
         if tree.joints[j].shortname() == "JointModelFreeFlyer":
             body.add_freejoint(name=str(tree.names[j]))
             return
+        coordinates = self.world.coordinates
         for k, name in enumerate(names):
             joint, slides = self._add_joint(body, name, axes[:, k])
-            servo, column = driven.get(name), self.world.coordinates.index(name)
+            servo = driven.get(name)
             if servo is not None:
                 servo.configure_joint(joint, self.mj)
                 continue
             owner, _, own = name.partition(".")
             stated = self.world.scene.objects[owner].object.resistance.get(own, Resistance())
             usual = self.physics.prismatic_damping if slides else self.physics.revolute_damping
-            joint.damping[0], joint.frictionloss = stated.damping or usual, stated.friction
-            joint.stiffness[0], joint.springref = stated.stiffness, stated.springref
-            bounds = self.world.coordinates.lower[column], self.world.coordinates.upper[column]
-            if np.isfinite(bounds).all():
-                joint.limited, joint.range = self.mj.mjtLimited.mjLIMITED_TRUE, bounds
+            joint.damping[0] = stated.damping or usual
+            joint.frictionloss = stated.friction
+            joint.stiffness[0] = stated.stiffness
+            joint.springref = stated.springref
+            column = coordinates.index(name)
+            limits = (coordinates.lower[column], coordinates.upper[column])
+            if np.isfinite(limits).all():
+                joint.limited = self.mj.mjtLimited.mjLIMITED_TRUE
+                joint.range = limits
 
     def _add_joint(self, body: Any, name: str, twist: Floats) -> tuple[Any, bool]:
-        """Add a joint along or about a twist's axis, shape (6,)."""
-        kind, slides = self.mj.mjtJoint, bool(np.linalg.norm(twist[:3]) > 0.5)
-        axis = twist[:3] if slides else twist[3:]
-        return body.add_joint(
-            name=name, axis=axis, type=kind.mjJNT_SLIDE if slides else kind.mjJNT_HINGE
-        ), slides
+        """Add a joint along or about a twist's axis, shape (6,); return it and whether it slides.
+
+        The twist has the linear velocity first, as in Pinocchio.
+        """
+        slides = bool(np.linalg.norm(twist[:3]) > 0.5)
+        if slides:
+            kind = self.mj.mjtJoint.mjJNT_SLIDE
+            axis = twist[:3]
+        else:
+            kind = self.mj.mjtJoint.mjJNT_HINGE
+            axis = twist[3:]
+        joint = body.add_joint(name=name, axis=axis, type=kind)
+        return joint, slides
 
     def _is_balanced(self, joint: int) -> bool:
         """Return whether springs balance the weight on an object's joint."""
-        placed = self.world.scene.objects.get(str(self.world.model.names[joint]).partition(".")[0])
+        owner = str(self.world.model.names[joint]).partition(".")[0]
+        placed = self.world.scene.objects.get(owner)
         return self.physics.balanced and placed is not None and not placed.object.free
 
     def _add_geoms(self, pairs: Pairs) -> None:
         """Add the collision shapes and their contact pairs."""
-        sliding, rolling = self.physics.friction, self.physics.rolling_friction
+        sliding = self.physics.friction
+        rolling = self.physics.rolling_friction
         is_sphere = [isinstance(shape.geometry, coal.Sphere) for shape in self.world.shapes]
         for number, shape in enumerate(self.world.shapes):
-            body, place = self.moved_shapes.get(
-                number, (self.bodies[shape.parentJoint], shape.placement)
-            )
+            body = self.bodies[shape.parentJoint]
+            place = shape.placement
+            if number in self.moved_shapes:
+                body, place = self.moved_shapes[number]
             geom = self.add_geom(body, f"shape {number}", shape.geometry, place)
-            geom.contype, geom.conaffinity = int(pairs.types[number]), int(pairs.affinities[number])
-            geom.friction[0], geom.friction[2] = sliding, rolling
+            geom.contype = int(pairs.types[number])
+            geom.conaffinity = int(pairs.affinities[number])
+            geom.friction[0] = sliding
+            geom.friction[2] = rolling
             geom.condim = 6 if is_sphere[number] else 4  # only the former have rolling friction
-            geom.solref, geom.group = _CONTACT, 3
+            geom.solref = _CONTACT
+            geom.group = _HIDDEN_GROUP
             geom.rgba = [*np.asarray(shape.meshColor)[:3], 1.0]
         for first, second in pairs.always.tolist():
             pair = self.spec.add_pair(geomname1=f"shape {first}", geomname2=f"shape {second}")
             pair.condim = 6 if is_sphere[first] or is_sphere[second] else 4
-            pair.friction[:2], pair.friction[3:], pair.solref = sliding, rolling, _CONTACT
+            pair.friction[:2] = sliding
+            pair.friction[3:] = rolling
+            pair.solref = _CONTACT
             if self.has_friction_grasps:
                 pair.solreffriction = [2.0 * self.physics.timestep, 1.0]
 
@@ -315,7 +355,9 @@ class Builder:
         weld = self.spec.add_equality(
             type=self.mj.mjtEq.mjEQ_WELD, objtype=self.mj.mjtObj.mjOBJ_BODY, active=False
         )
-        weld.name1, weld.name2, weld.data[10] = holder.name, held.name, 1.0
+        weld.name1 = holder.name
+        weld.name2 = held.name
+        weld.data[10] = 1.0
         weld.solref = [2.0 * self.physics.timestep, 1.0]  # as stiff as the integrator allows
         weld.solimp[:2] = _WELD_IMPEDANCE
 
@@ -326,11 +368,13 @@ class Builder:
         body = link.add_body(
             name=name, pos=place.translation, quat=to_mujoco_quaternion(place), gravcomp=1.0
         )
-        body.mass, body.inertia = _CARRIER_MASS, np.full(3, _CARRIER_INERTIA)
+        body.mass = _CARRIER_MASS
+        body.inertia = np.full(3, _CARRIER_INERTIA)
         body.explicitinertial = True
-        joints = self._carrier_joints[hold] = []
+        kinds = self.mj.mjtJoint
+        joints: list[str] = []
+        self._carrier_joints[hold] = joints
         for k, freedom in enumerate(attachment.freedoms):
-            kinds = self.mj.mjtJoint
             kind = kinds.mjJNT_HINGE if freedom.kind == "revolute" else kinds.mjJNT_SLIDE
             joint = body.add_joint(
                 name=f"{name} {k}", type=kind, axis=freedom.axis, pos=freedom.through
@@ -346,26 +390,31 @@ class Builder:
 
     def _add_joint_equality(self, joint: str, value: float, *, active: bool = False) -> Any:
         """Add an equality that fixes a joint at a value, and return it."""
-        kind, of = self.mj.mjtEq.mjEQ_JOINT, self.mj.mjtObj.mjOBJ_JOINT
-        equality = self.spec.add_equality(type=kind, objtype=of, name1=joint, active=active)
+        equality = self.spec.add_equality(
+            type=self.mj.mjtEq.mjEQ_JOINT,
+            objtype=self.mj.mjtObj.mjOBJ_JOINT,
+            name1=joint,
+            active=active,
+        )
         equality.data[0] = value
         return equality
 
     def _add_coupling(self, move: MovedJoint) -> None:
         """Add an equality that couples a mimic joint to the joint that it follows."""
-        equality = self._add_joint_equality(
-            str(self.world.model.names[move.joint]), move.offset, active=True
-        )
+        follower = str(self.world.model.names[move.joint])
+        equality = self._add_joint_equality(follower, move.offset, active=True)
         equality.name2 = self.world.coordinates.names[move.coordinate]
         equality.data[1] = move.factor
         equality.solref = [2.0 * self.physics.timestep, 1.0]  # as stiff as the integrator allows
 
     def _find_addresses(self, model: Any) -> tuple[Ints, Ints]:
         """Return the indices of the world coordinates in MuJoCo's positions and velocities."""
-        columns, dofs, done, tree = list[int](), list[int](), set[int](), self.world.model
-        for name, j in zip(
-            self.world.coordinates.names, self.world.coordinates.joints, strict=True
-        ):
+        tree = self.world.model
+        coordinates = self.world.coordinates
+        columns: list[int] = []
+        dofs: list[int] = []
+        done = set[int]()  # free joints
+        for name, j in zip(coordinates.names, coordinates.joints, strict=True):
             if tree.joints[j].shortname() != "JointModelFreeFlyer":
                 joint = model.joint(name)
                 columns.append(int(joint.qposadr[0]))

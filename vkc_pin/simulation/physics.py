@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -14,10 +15,14 @@ from vkc_pin.utils.optional_imports import import_optional
 from vkc_pin.world.models.dynamics import compute_solid_inertia
 from vkc_pin.world.trajectory.world_model import World
 
-_NO_MASS = 1e-9  # [kg] up to which a body counts as massless
-_LEAST_MASS = 1e-3  # [kg] of bodies with neither mass nor collision shape
-_LEAST_INERTIA = 1e-6  # smallest moment of inertia per mass [m²]: (1 mm)²
-_ROUNDING = 0.05  # largest correction of an inertia that is not reported, relative
+# [kg] up to which a body counts as massless
+_NO_MASS = 1e-9
+# [kg] of bodies with neither mass nor collision shape
+_LEAST_MASS = 1e-3
+# [m²] smallest moment of inertia per mass: (1 mm)²
+_LEAST_INERTIA = 1e-6
+# largest correction of an inertia that is not reported, relative
+_ROUNDING = 0.05
 # Smallest and largest settings. Shorter time steps and longer waits take hours and gigabytes;
 # longer time steps miss contacts; beyond the others the integration breaks down at once.
 _RANGES = {
@@ -100,9 +105,8 @@ class Physics:
                 continue
             low, high = _RANGES[name]
             expected = f"a number from {low:g} to {high:g}"
-            value = check_number(
-                getattr(self, name), f"Physics.{name}", expected, low=low, high=high
-            )
+            stated = getattr(self, name)
+            value = check_number(stated, f"Physics.{name}", expected, low=low, high=high)
             object.__setattr__(self, name, value)
 
 
@@ -113,22 +117,22 @@ def import_mujoco() -> Any:
 
 def complete_inertias(world: World, physics: Physics) -> list[str]:
     """Give every body a mass and a physically possible inertia; return one note per assumption."""
-    tree, notes, estimated = world.model, list[str](), list[str]()
+    tree = world.model
+    notes: list[str] = []
+    estimated: list[str] = []
     for j in range(1, tree.njoints):
-        inertia, name = tree.inertias[j], str(tree.names[j])
+        inertia = tree.inertias[j]
+        name = str(tree.names[j])
         if inertia.mass <= _NO_MASS:
             solids = [shape for shape in world.bodies.geometryObjects if shape.parentJoint == j]
-            estimated += [name] if solids else []
-            inertia = pin.Inertia(
-                _LEAST_MASS, np.zeros(3), 1e3 * _LEAST_INERTIA * _LEAST_MASS * np.eye(3)
-            )
-            for solid in solids:
-                inertia += solid.placement.act(compute_solid_inertia(solid, physics.density))
-        tensor, added = _make_inertia_possible(inertia)
-        if added > _ROUNDING:
+            if solids:
+                estimated.append(name)
+            inertia = _estimate_inertia(solids, physics.density)
+        tensor, increase = _make_inertia_possible(inertia)
+        if increase > _ROUNDING:
             notes.append(
                 f"the inertia of {name} is physically impossible: "
-                f"its moments are increased by {100.0 * added:.0f} %"
+                f"its moments are increased by {100.0 * increase:.0f} %"
             )
         tree.inertias[j] = pin.Inertia(inertia.mass, inertia.lever, tensor)
     if estimated:
@@ -137,9 +141,26 @@ def complete_inertias(world: World, physics: Physics) -> list[str]:
     return notes
 
 
+def _estimate_inertia(solids: Sequence[pin.GeometryObject], density: float) -> pin.Inertia:
+    """Return the inertia of a massless body from its collision shapes, at a density [kg/m³]."""
+    moment = 1e3 * _LEAST_INERTIA * _LEAST_MASS
+    inertia = pin.Inertia(_LEAST_MASS, np.zeros(3), moment * np.eye(3))
+    for solid in solids:
+        inertia += solid.placement.act(compute_solid_inertia(solid, density))
+    return inertia
+
+
 def _make_inertia_possible(inertia: pin.Inertia) -> tuple[Floats, float]:
-    """Return the nearest possible inertia [kg·m²], shape (3, 3), and the relative increase."""
+    """Return the nearest possible inertia [kg·m²], shape (3, 3), and the relative increase.
+
+    The largest principal moment of a body is at most the sum of the two others. Adding a to all
+    three moments reduces the excess over this sum by a, and leaves the axes as they are. The
+    increase counts as 0 where a moment is not positive.
+    """
     tensor = np.asarray(inertia.inertia)
-    first, second, third = np.linalg.eigvalsh(tensor).tolist()
-    added = max(0.0, third - first - second, _LEAST_INERTIA * inertia.mass - first) * (1.0 + 1e-6)
-    return tensor + added * np.eye(3), added / max(third, 1e-12) if first > 0.0 else 0.0
+    smallest, middle, largest = np.linalg.eigvalsh(tensor).tolist()
+    excess = largest - smallest - middle
+    shortfall = _LEAST_INERTIA * inertia.mass - smallest
+    added = max(0.0, excess, shortfall) * (1.0 + 1e-6)
+    increase = added / max(largest, 1e-12) if smallest > 0.0 else 0.0
+    return tensor + added * np.eye(3), increase

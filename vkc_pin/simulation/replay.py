@@ -16,7 +16,8 @@ from vkc_pin.world.trajectory.placements import sample_motion
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
-_RATE = 20.0  # [Hz] key frames of a page
+# [Hz] key frames of a page
+_RATE = 20.0
 
 
 class Execution(Protocol):
@@ -50,12 +51,22 @@ class Replay(World):
 
     def __init__(self, scene: Scene, times: Floats, rows: Floats) -> None:
         super().__init__(scene)
-        self._times, self._rows = times, rows.copy()
-        for name in (name for name, placed in scene.objects.items() if placed.object.free):
-            quaternions = self._rows[:, self.get_placement_columns(name)][:, 3:]
-            flips = np.einsum("kc,kc->k", quaternions[1:], quaternions[:-1]) < 0.0
-            signs = np.cumprod([1.0, *np.where(flips, -1.0, 1.0)])
-            self._rows[:, self.get_placement_columns(name)][:, 3:] *= signs[:, None]
+        self._times = times
+        self._rows = rows.copy()
+        for name, placed in scene.objects.items():
+            if placed.object.free:
+                self._align_quaternions(name)
+
+    def _align_quaternions(self, name: str) -> None:
+        """Negate quaternions of a free object that would be interpolated the long way round.
+
+        q and −q are the same rotation.
+        """
+        placements = self._rows[:, self.get_placement_columns(name)]
+        quaternions = placements[:, 3:]
+        is_opposite = np.einsum("kc,kc->k", quaternions[1:], quaternions[:-1]) < 0.0
+        signs = np.cumprod([1.0, *np.where(is_opposite, -1.0, 1.0)])
+        quaternions *= signs[:, None]
 
     def compute_positions(
         self, trajectory: Trajectory, times: Any = None, free: FreeObjects | None = None
@@ -78,27 +89,33 @@ def write_page(
     from vkc_pin.visualization.drawing import Drawing
     from vkc_pin.visualization.viewer import Recorder, render_page
 
-    times, phases = executed.trajectory.times, executed.trajectory.phases
-    moments = np.linspace(times[0], times[-1], max(2, int((times[-1] - times[0]) * _RATE) + 1))
-    world, recorder = Replay(executed.scene, times, executed.rows), Recorder()
-    beside = sample_motion(World(executed.scene), executed.planned, moments)
-    viewer = meshcat.Visualizer(window=recorder)
+    times = executed.trajectory.times
+    begin = float(times[0])
+    end = float(times[-1])
+    frame_count = max(2, int((end - begin) * _RATE) + 1)
+    frame_times = np.linspace(begin, end, frame_count)
+    recorder = Recorder()
     drawing = Drawing(
-        viewer, executed.scene, executed.trajectory, world=world, times=moments, beside=beside
+        meshcat.Visualizer(window=recorder),
+        executed.scene,
+        executed.trajectory,
+        world=Replay(executed.scene, times, executed.rows),
+        times=frame_times,
+        beside=sample_motion(World(executed.scene), executed.planned, frame_times),
     )
     drawing.draw(play=False)
-    begin = float(times[0])
+    phases = [
+        {"name": phase.name, "last": float(times[phase.last]) - begin}
+        for phase in executed.trajectory.phases
+    ]
     film = {
-        "duration": float(times[-1]) - begin,
-        "phases": [
-            {"name": phase.name, "last": float(times[phase.last]) - begin} for phase in phases
-        ],
+        "duration": end - begin,
+        "phases": phases,
         "notes": [{"text": text, "time": time - begin} for text, time in notes],
         "because": [],
         "headline": f"{headline} (translucent: as planned)",
         "ghosts": False,
         "portrait": drawing.find_portrait_position(),
     }
-    return write_atomically(
-        path, render_page(recorder, title=f"{headline} – vkc_pin", film=film).encode("utf-8")
-    )
+    page = render_page(recorder, title=f"{headline} – vkc_pin", film=film)
+    return write_atomically(path, page.encode("utf-8"))

@@ -40,8 +40,10 @@ GOAL = {"m": 0.01, "rad": 0.02}
 """Tolerances within which a goal counts as reached."""
 DEPTH = 1e-3
 """Penetration depth up to which an unplanned contact is harmless [m]."""
-_LISTED_CONTACTS = 8  # contacts in a report
-_LISTED_MOTORS = 4  # motors in a report, by decreasing load
+# contacts in a report
+_LISTED_CONTACTS = 8
+# motors in a report, by decreasing load
+_LISTED_MOTORS = 4
 
 
 @dataclass(frozen=True)
@@ -69,29 +71,43 @@ class Tracking:
     def from_samples(
         cls, times: Floats, errors: Floats, efforts: Floats, servos: Sequence[Servo], size: int
     ) -> Tracking:
-        """Compute the tracking errors from samples."""
+        """Compute the tracking errors from samples.
 
-        def compute_max_and_rms(values: Floats) -> tuple[float, float]:
-            return float(np.abs(values).max(initial=0.0)), float(
-                np.sqrt(np.mean(np.square(values)))
-            ) if values.size else 0.0
-
+        Args:
+            times: Times of the samples, shape (K,) [s].
+            errors: Tracking errors, shape (K, servos), [m] or [rad].
+            efforts: Forces of the motors, shape (K, servos), [N·m] or [N].
+            servos: Servos of base, arm and fingers.
+            size: Number of coordinates of base and arm.
+        """
         names = [servo.coordinate for servo in servos]
-        peaks = np.abs(efforts).max(axis=0)
         arm = errors[:, 3:size]
-        at = np.unravel_index(int(np.argmax(np.abs(arm))), arm.shape) if arm.size else (0, 0)
+        worst_joint = ""
+        worst_time = float(times[0])
+        if arm.size:
+            row, column = np.unravel_index(int(np.argmax(np.abs(arm))), arm.shape)
+            worst_joint = names[3 + int(column)]
+            worst_time = float(times[int(row)])
+        peaks = np.abs(efforts).max(axis=0)
+        shares: dict[str, float] = {}
+        for servo, peak in zip(servos, peaks, strict=True):
+            if np.isfinite(servo.limit):
+                shares[servo.coordinate] = float(peak / servo.limit)
         return cls(
-            arm=compute_max_and_rms(arm),
-            base=compute_max_and_rms(np.hypot(errors[:, 0], errors[:, 1])),
-            heading=compute_max_and_rms(errors[:, 2]),
-            worst=(names[3 + int(at[1])] if arm.size else "", float(times[int(at[0])])),
+            arm=_compute_max_and_rms(arm),
+            base=_compute_max_and_rms(np.hypot(errors[:, 0], errors[:, 1])),
+            heading=_compute_max_and_rms(errors[:, 2]),
+            worst=(worst_joint, worst_time),
             efforts=dict(zip(names, peaks.tolist(), strict=True)),
-            shares={
-                s.coordinate: float(p / s.limit)
-                for s, p in zip(servos, peaks, strict=True)
-                if np.isfinite(s.limit)
-            },
+            shares=shares,
         )
+
+
+def _compute_max_and_rms(values: Floats) -> tuple[float, float]:
+    """Compute the largest magnitude of values and their root mean square; 0 without values."""
+    if not values.size:
+        return 0.0, 0.0
+    return float(np.abs(values).max()), float(np.sqrt(np.mean(np.square(values))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,16 +165,21 @@ class SimulationResult:
                 0.2 rad.
         """
         if self.diverged is not None:
-            problem, expected = "the integration diverged", "an execution that ended"
-            got = f"diverged at {self.diverged:.2f} s"
-            raise InputError(problem, field="end_scene", expected=expected, got=got)
-        world, row = World(self.scene), self.rows[-1]
+            raise InputError(
+                "the integration diverged",
+                field="end_scene",
+                expected="an execution that ended",
+                got=f"diverged at {self.diverged:.2f} s",
+            )
+        world = World(self.scene)
+        row = self.rows[-1]
         values = dict(zip(world.coordinates.names, row.tolist(), strict=True))
         scene = make_scene_at(self.scene, world, row, values)
         tool = compute_placement(world, row, scene.robot.tool_frame)
         lost = {grip.what: grip.problem is not None for grip in self.grips}  # the last time
         kept = {str(hold) for hold in self.planned.phases[-1].holds}
-        holds, measured = list[Hold](), dict[str, pin.SE3]()
+        holds: list[Hold] = []
+        measured: dict[str, pin.SE3] = {}
         for hold in compile_each_step(self.scene, self.steps, Options())[-1].after:
             attachment = get_attachment(scene.objects, hold)
             if attachment.contact == "push" or hold.by not in (None, *holds):
@@ -181,51 +202,49 @@ class SimulationResult:
 
     def problems(self) -> list[str]:
         """Return what failed, one line each."""
-        problems = (
-            [] if self.diverged is None else [f"the integration diverged at {self.diverged:.2f} s"]
-        )
+        problems: list[str] = []
+        if self.diverged is not None:
+            problems.append(f"the integration diverged at {self.diverged:.2f} s")
         problems += [str(miss) for miss in self.misses if miss.amount > GOAL[miss.unit]]
         problems += [grip.problem for grip in self.grips if grip.problem is not None]
-        return problems + [str(contact) for contact in self.contacts if contact.depth > DEPTH]
+        problems += [str(contact) for contact in self.contacts if contact.depth > DEPTH]
+        return problems
 
     def summary(self) -> str:
         """Return a readable report."""
-        t, problems = self.tracking, self.problems()
-        head = "ok" if self.ok else f"FAILED, {len(problems)} problem(s)"
-        degrees = [np.degrees(value) for value in (*t.arm, *t.heading)]
-        lines = [
-            f"{self.scene.name} in physics: {head} — "
-            + ", ".join(phase.name for phase in self.planned.phases),
-            *(f"  goal        {miss}" for miss in self.misses),
-            f"  tracking    arm within {degrees[0]:.2f}° ({degrees[1]:.3f}° rms; "
-            f"worst {t.worst[0]} at {t.worst[1]:.2f} s), "
-            f"base within {1e3 * t.base[0]:.1f} mm ({1e3 * t.base[1]:.2f} mm rms), "
-            f"heading within {degrees[2]:.2f}°",
-        ]
-        for grip in self.grips:
-            broken = (
-                "" if grip.broken is None else f", PULLED OUT OF THE HAND at {grip.broken:.2f} s"
-            )
-            if grip.missed:
-                broken = ", MISSED"
-            force = f"{grip.force:.0f} N and {grip.torque:.1f} N·m at most"
-            slip = f", slips by {1e3 * grip.slip:.1f} mm" if grip.slip else ""
-            span = f"{grip.begin:.1f} to {grip.end:.1f} s"
-            lines.append(f"  grasp       {grip.what}, {span}: {force}{slip}{broken}")
-        shares = sorted(t.shares.items(), key=lambda item: -item[1])
+        problems = self.problems()
+        verdict = "ok" if self.ok else f"FAILED, {len(problems)} problem(s)"
+        phases = ", ".join(phase.name for phase in self.planned.phases)
+        lines = [f"{self.scene.name} in physics: {verdict} — {phases}"]
+        lines += [f"  goal        {miss}" for miss in self.misses]
+        lines.append(self._describe_tracking())
+        lines += [_describe_grip(grip) for grip in self.grips]
+        shares = sorted(self.tracking.shares.items(), key=lambda item: -item[1])
         if shares:
-            loads = ", ".join(
-                f"{name} {100.0 * share:.0f} %" for name, share in shares[:_LISTED_MOTORS]
-            )
-            lines.append(f"  motors      at most {loads} of their limits")
+            loads = [f"{name} {100.0 * share:.0f} %" for name, share in shares[:_LISTED_MOTORS]]
+            lines.append(f"  motors      at most {', '.join(loads)} of their limits")
         count = f"{len(self.contacts)} not planned" if self.contacts else "as planned"
         lines.append(f"  contacts    {count}")
         lines += [f"  - {contact}" for contact in self.contacts[:_LISTED_CONTACTS]]
-        if (more := len(self.contacts) - _LISTED_CONTACTS) > 0:
+        more = len(self.contacts) - _LISTED_CONTACTS
+        if more > 0:
             lines.append(f"  ... and {more} more")
         lines += [f"  note        {note}" for note in self.notes]
         lines += [f"  because     {problem}" for problem in problems]
         return "\n".join(lines)
+
+    def _describe_tracking(self) -> str:
+        """Return the line of a report about tracking errors."""
+        tracking = self.tracking
+        arm, arm_rms = np.degrees(tracking.arm)
+        heading, _ = np.degrees(tracking.heading)
+        base, base_rms = tracking.base
+        joint, time = tracking.worst
+        return (
+            f"  tracking    arm within {arm:.2f}° ({arm_rms:.3f}° rms; worst {joint} at "
+            f"{time:.2f} s), base within {1e3 * base:.1f} mm ({1e3 * base_rms:.2f} mm rms), "
+            f"heading within {heading:.2f}°"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as plain data, e.g. for JSON."""
@@ -246,7 +265,8 @@ class SimulationResult:
 
     def to_json(self, path: str | Path) -> Path:
         """Write `to_dict` as JSON atomically, and return the path."""
-        return write_atomically(path, (json.dumps(self.to_dict(), indent=1) + "\n").encode("utf-8"))
+        text = json.dumps(self.to_dict(), indent=1) + "\n"
+        return write_atomically(path, text.encode("utf-8"))
 
     def to_html(self, path: str | Path) -> Path:
         """Write a web page with the executed motion and the plan as a ghost; return its path."""
@@ -256,12 +276,9 @@ class SimulationResult:
                 notes.append((f"the hand misses {grip.what}", grip.begin))
             elif grip.broken is not None:
                 notes.append((f"{grip.what} is pulled out of the hand", grip.broken))
-        return write_page(
-            self,
-            path,
-            headline=f"{self.scene.name} in physics: {'ok' if self.ok else 'FAILED'}",
-            notes=notes,
-        )
+        verdict = "ok" if self.ok else "FAILED"
+        headline = f"{self.scene.name} in physics: {verdict}"
+        return write_page(self, path, headline=headline, notes=notes)
 
     def plot(self, path: str | Path, *, count: int = 6) -> Path:
         """Write an image (.png) of `count` snapshots, and return its path."""
@@ -274,3 +291,17 @@ class SimulationResult:
     def __repr__(self) -> str:
         verdict = "ok" if self.ok else "FAILED"
         return f"<SimulationResult {self.scene.name}: {verdict}, {len(self.contacts)} contacts>"
+
+
+def _describe_grip(grip: Grip) -> str:
+    """Return the line of a report about a grasp."""
+    if grip.missed:
+        end = ", MISSED"
+    elif grip.broken is not None:
+        end = f", PULLED OUT OF THE HAND at {grip.broken:.2f} s"
+    else:
+        end = ""
+    span = f"{grip.begin:.1f} to {grip.end:.1f} s"
+    force = f"{grip.force:.0f} N and {grip.torque:.1f} N·m at most"
+    slip = f", slips by {1e3 * grip.slip:.1f} mm" if grip.slip else ""
+    return f"  grasp       {grip.what}, {span}: {force}{slip}{end}"

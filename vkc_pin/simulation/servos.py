@@ -17,13 +17,20 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.wheels import rotate_into_base_frame
 from vkc_pin.world.trajectory.world_model import World
 
-_UNLIMITED = 1e300  # Pinocchio's effort limits above this mean none
+# Pinocchio's effort limits above this mean none
+_UNLIMITED = 1e300
 # [s²] The effort limit accelerates a joint's own rotor by 1500 rad/s²: 0.1 kg·m² at 150 N·m.
 _ROTOR_INERTIA_PER_EFFORT = 1.0 / 1500.0
-_SAG = {"rad": 0.05, "m": 0.005}  # largest deflection under a load of full effort
-_ROTOR_INERTIA_RATIO = 0.05  # rotor to load inertia, for joints without an effort limit
-_SAMPLES = 40  # configurations of the plan at which inertias are computed
-_DIFFERENCE = 0.01  # [s] interval of finite differences for velocities
+# largest deflection under a load of full effort
+_SAG = {"rad": 0.05, "m": 0.005}
+# rotor to load inertia, for joints without an effort limit
+_ROTOR_INERTIA_RATIO = 0.05
+# configurations of the plan at which inertias are computed
+_SAMPLES = 40
+# [s] interval of finite differences for velocities
+_DIFFERENCE = 0.01
+# coordinates of the base: x, y, yaw
+_BASE_SIZE = 3
 
 
 @dataclass(frozen=True)
@@ -51,7 +58,8 @@ class Servo:
 
     def configure_joint(self, joint: Any, mj: Any) -> None:
         """Set the rotor inertia and force limit of a joint of a `mujoco.MjSpec`."""
-        joint.armature, joint.actgravcomp = self.armature, True
+        joint.armature = self.armature
+        joint.actgravcomp = True
         if np.isfinite(self.limit):
             joint.actfrclimited = mj.mjtLimited.mjLIMITED_TRUE
             joint.actfrcrange = [-self.limit, self.limit]
@@ -61,7 +69,8 @@ class Servo:
         actuator = spec.add_actuator(
             name=self.coordinate, target=self.coordinate, trntype=mj.mjtTrn.mjTRN_JOINT
         )
-        actuator.gaintype, actuator.biastype = mj.mjtGain.mjGAIN_FIXED, mj.mjtBias.mjBIAS_AFFINE
+        actuator.gaintype = mj.mjtGain.mjGAIN_FIXED
+        actuator.biastype = mj.mjtBias.mjBIAS_AFFINE
         actuator.gainprm[0] = self.stiffness
         actuator.biasprm[:3] = [0.0, -self.stiffness, -self.damping]
 
@@ -75,24 +84,34 @@ def make_servos(world: World, rows: Floats, physics: Physics) -> tuple[Servo, ..
             inertia that it moves there.
         physics: Bandwidths and damping.
     """
-    model, data, robot = world.model, world.model.createData(), world.scene.robot
-    count = len(world.scene.start) + (0 if robot.gripper is None else len(robot.gripper.names))
+    model = world.model
+    data = model.createData()
+    coordinates = world.coordinates
+    gripper = world.scene.robot.gripper
+    finger_count = 0 if gripper is None else len(gripper.names)
+    count = len(world.scene.start) + finger_count
     inertias = np.zeros(model.nv)
-    for q in world.coordinates.q(rows[:: max(1, len(rows) // _SAMPLES)]):
+    stride = max(1, len(rows) // _SAMPLES)
+    for q in coordinates.q(rows[::stride]):
         inertias = np.maximum(inertias, np.diag(pin.crba(model, data, q)))
-    result = []
-    for k, name in enumerate(world.coordinates.names[:count]):
-        velocity = model.joints[world.coordinates.joints[k]].idx_v + (k if k < 3 else 0)
-        stated, load_inertia = float(model.effortLimit[velocity]), float(inertias[velocity])
-        limit = stated if 0.0 < stated < _UNLIMITED and k > 2 else np.inf
-        bandwidth = physics.base_bandwidth if k < 3 else physics.arm_bandwidth
-        unit = world.coordinates.units[k]
-        result.append(
-            make_servo(
-                name, load_inertia, limit, unit, bandwidth, physics.damping_ratio, has_rotor=k > 2
-            )
+    servos: list[Servo] = []
+    for k, name in enumerate(coordinates.names[:count]):
+        is_base = k < _BASE_SIZE
+        # The base is one joint with three velocities.
+        velocity = model.joints[coordinates.joints[k]].idx_v + (k if is_base else 0)
+        effort_limit = float(model.effortLimit[velocity])
+        is_limited = 0.0 < effort_limit < _UNLIMITED and not is_base
+        servo = make_servo(
+            name,
+            float(inertias[velocity]),
+            effort_limit if is_limited else np.inf,
+            coordinates.units[k],
+            physics.base_bandwidth if is_base else physics.arm_bandwidth,
+            physics.damping_ratio,
+            has_rotor=not is_base,
         )
-    return tuple(result)
+        servos.append(servo)
+    return tuple(servos)
 
 
 def make_servo(
@@ -107,6 +126,10 @@ def make_servo(
 ) -> Servo:
     """Design a servo.
 
+    With the natural frequency ω and the damping ratio ζ, a servo that moves the inertia m has the
+    stiffness k = m ω² and the damping 2 ζ √(k m). A motor with a force limit is stiff enough that a
+    load of full effort deflects it by no more than `_SAG`.
+
     Args:
         coordinate: Driven coordinate.
         load_inertia: Largest inertia that it moves, without the rotor [kg·m²] or [kg].
@@ -116,25 +139,19 @@ def make_servo(
         damping_ratio: Damping ratio.
         has_rotor: Whether its motor has a rotor.
     """
-    armature = (
-        0.0
-        if not has_rotor
-        else limit * _ROTOR_INERTIA_PER_EFFORT
-        if np.isfinite(limit)
-        else _ROTOR_INERTIA_RATIO * load_inertia
-    )
+    is_limited = bool(np.isfinite(limit))
+    if not has_rotor:
+        armature = 0.0
+    elif is_limited:
+        armature = limit * _ROTOR_INERTIA_PER_EFFORT
+    else:
+        armature = _ROTOR_INERTIA_RATIO * load_inertia
     inertia = load_inertia + armature
     stiffness = inertia * bandwidth**2
-    if np.isfinite(limit):
+    if is_limited:
         stiffness = max(stiffness, limit / _SAG[unit])
-    return Servo(
-        coordinate,
-        stiffness,
-        2.0 * damping_ratio * float(np.sqrt(stiffness * inertia)),
-        inertia,
-        armature,
-        limit,
-    )
+    damping = 2.0 * damping_ratio * float(np.sqrt(stiffness * inertia))
+    return Servo(coordinate, stiffness, damping, inertia, armature, limit)
 
 
 def sample_reference(trajectory: Trajectory, times: Floats) -> tuple[Floats, Floats, Floats]:
@@ -143,14 +160,15 @@ def sample_reference(trajectory: Trajectory, times: Floats) -> tuple[Floats, Flo
     Without a curve, velocities are discontinuous and accelerations are zero.
     """
     robot = slice(0, trajectory.robot_size)
+    positions = trajectory.at(times)[:, robot]
     if trajectory.curve is not None:
-        read = trajectory.at, trajectory.velocity, trajectory.acceleration
-        positions, velocities, accelerations = (values(times)[:, robot] for values in read)
+        velocities = trajectory.velocity(times)[:, robot]
+        accelerations = trajectory.acceleration(times)[:, robot]
         return positions, velocities, accelerations
-    later, earlier = (
-        trajectory.at(times + shift)[:, robot] for shift in (_DIFFERENCE / 2.0, -_DIFFERENCE / 2.0)
-    )
-    return trajectory.at(times)[:, robot], (later - earlier) / _DIFFERENCE, np.zeros_like(later)
+    later = trajectory.at(times + _DIFFERENCE / 2.0)[:, robot]
+    earlier = trajectory.at(times - _DIFFERENCE / 2.0)[:, robot]
+    velocities = (later - earlier) / _DIFFERENCE
+    return positions, velocities, np.zeros_like(positions)
 
 
 def compute_feedforward(
@@ -168,25 +186,25 @@ def compute_feedforward(
         rows: Their positions, shape (K, servos).
         motion: Positions, velocities and accelerations of base and arm, shape (K, robot's) each.
     """
-    robot, size = world.scene.robot, motion[0].shape[1]
+    robot = world.scene.robot
     model = pin.Model(robot.model if robot.gripper is None else robot.gripper.model)
     model.gravity = pin.Motion.Zero()
     for joint in range(1, model.njoints):
         model.inertias[joint] = world.model.inertias[joint]
-    velocities, accelerations = (
-        np.pad(part, ((0, 0), (0, rows.shape[1] - size))) for part in motion[1:]
-    )
+    positions, robot_velocities, robot_accelerations = motion
+    # Fingers count as at rest.
+    padding = ((0, 0), (0, rows.shape[1] - positions.shape[1]))
+    velocities = np.pad(robot_velocities, padding)
+    accelerations = np.pad(robot_accelerations, padding)
     rotor_torques = accelerations * [servo.armature for servo in servos]
-    v, a = transform_to_base_axes(rows[:, 2], velocities, accelerations)
+    headings = rows[:, 2]
+    v, a = transform_to_base_axes(headings, velocities, accelerations)
     data = model.createData()
-    torques = np.array(
-        [
-            pin.rnea(model, data, *state)
-            for state in zip(Coordinates(model).q(rows), v, a, strict=True)
-        ]
-    )
+    states = zip(Coordinates(model).q(rows), v, a, strict=True)
+    torques = np.array([pin.rnea(model, data, *state) for state in states])
     # The servos act along the world's axes.
-    torques[:, :2] = np.transpose(rotate_into_base_frame(torques[:, 0], torques[:, 1], -rows[:, 2]))
+    forces = rotate_into_base_frame(torques[:, 0], torques[:, 1], -headings)
+    torques[:, :2] = np.transpose(forces)
     return rotor_torques + torques
 
 
@@ -199,9 +217,9 @@ def sample_fingers(world: World, rows: Floats, row_times: Floats, times: Floats)
         row_times: Their times [s].
         times: Sampling times, shape (K,) [s].
     """
-    first = len(world.scene.start)
     gripper = world.scene.robot.gripper
-    columns: Sequence[int] = range(first, first + (0 if gripper is None else len(gripper.names)))
-    return np.column_stack(
-        [np.zeros((len(times), 0)), *(np.interp(times, row_times, rows[:, k]) for k in columns)]
-    )
+    if gripper is None:
+        return np.zeros((len(times), 0))
+    first = len(world.scene.start)
+    columns = rows[:, first : first + len(gripper.names)]
+    return np.column_stack([np.interp(times, row_times, column) for column in columns.T])

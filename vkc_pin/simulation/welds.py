@@ -6,7 +6,7 @@ A hand that closes beside the attachment, farther off than a measured grasp may 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -26,8 +26,12 @@ from vkc_pin.world.scene.hold import (
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-_AVERAGING_TIME = 0.02  # [s] of the moving average of forces: rubber yields, a weld does not
-_LATCH_TOLERANCE = 2e-3  # [rad] or [m] from the latched position within which a latch engages
+# [s] of the moving average of forces: rubber yields, a weld does not
+_AVERAGING_TIME = 0.02
+# [rad] or [m] from the latched position within which a latch engages
+_LATCH_TOLERANCE = 2e-3
+# Rotational rows of a weld act on half angles, as quaternions do.
+_WELD_SCALES = (1.0, 1.0, 1.0, 0.5, 0.5, 0.5)
 
 
 @dataclass(frozen=True)
@@ -76,17 +80,20 @@ class Grip:
 
 def find_hold_spans(scene: Scene, trajectory: Trajectory) -> list[tuple[Hold, float, float]]:
     """Return each hold that is not a push with its begin and end [s], ordered by begin."""
-    spans, active_since = list[tuple[Hold, float, float]](), dict[Hold, float]()
-    times = trajectory.times
-    held = [set(scene.holds), *(set(phase.holds) for phase in trajectory.phases)]
-    begins = [-np.inf, *(float(times[phase.first]) for phase in trajectory.phases)]
-    for now, at in zip(held, begins, strict=True):
-        for hold in [hold for hold in active_since if hold not in now]:
-            spans.append((hold, active_since.pop(hold), at))
-        active_since |= {
-            hold: at for hold in now if hold not in active_since and not _is_push(scene, hold)
-        }
-    spans += [(hold, at, np.inf) for hold, at in active_since.items()]
+    spans: list[tuple[Hold, float, float]] = []
+    begins: dict[Hold, float] = {}  # of holds that have not ended
+    changes = [(-np.inf, set(scene.holds))]
+    for phase in trajectory.phases:
+        changes.append((float(trajectory.times[phase.first]), set(phase.holds)))
+    for time, holds in changes:
+        ended = [hold for hold in begins if hold not in holds]
+        for hold in ended:
+            spans.append((hold, begins.pop(hold), time))
+        for hold in holds:
+            if not _is_push(scene, hold):
+                begins.setdefault(hold, time)
+    for hold, begin in begins.items():
+        spans.append((hold, begin, np.inf))
     return sorted(spans, key=lambda span: (span[1], str(span[0])))
 
 
@@ -157,9 +164,14 @@ class Grips:
         *,
         touching: Collection[Hold] = (),
     ) -> None:
-        self.physical, self.pairs, self._touching = physical, pairs, touching
-        self.holds, self.schedule = list(holds), list(schedule)
-        self.trajectory, self.physics, self._engine = trajectory, physics, import_mujoco()
+        self.physical = physical
+        self.pairs = pairs
+        self.holds = list(holds)
+        self.schedule = list(schedule)
+        self.trajectory = trajectory
+        self.physics = physics
+        self._touching = touching
+        self._engine = import_mujoco()
         self.grips: list[Grip] = []
         self._active: dict[Hold, tuple[int, float]] = {}  # index into grips, and end [s]
         self._forces: dict[Hold, deque[Floats]] = {}
@@ -174,49 +186,48 @@ class Grips:
 
     def follow(self, data: Any, clock: float) -> None:
         """Begin and end the holds that are due at a time [s] of the plan."""
-        for hold in [hold for hold, (_, end) in self._active.items() if end <= clock]:
+        ended = [hold for hold, (_, end) in self._active.items() if end <= clock]
+        for hold in ended:
             self._release(data, hold)
         while self.schedule and self.schedule[0][1] <= clock:
             hold, begin, end = self.schedule.pop(0)
-            first, last = self.trajectory.times[[0, -1]].tolist()
-            planned = compute_planned_freedoms(
-                self.physical.world.scene, self.trajectory, hold, clock
-            )
-            values, distance, angle = measure_hand(self.physical, data, hold, planned)
-            grip = Grip(
-                str(hold), max(begin, first), min(end, last), distance=distance, angle=angle
-            )
-            if not grip.missed:
-                self._engage(data, hold, values)
-                self._active[hold] = len(self.grips), end
-                self._forces[hold] = deque(maxlen=self._window)
-            self.grips.append(grip)
+            self._begin(data, hold, begin, end, clock)
+
+    def _begin(self, data: Any, hold: Hold, begin: float, end: float, clock: float) -> None:
+        """Close the hand at an attachment: weld it if it is near enough."""
+        first, last = self.trajectory.times[[0, -1]].tolist()
+        scene = self.physical.world.scene
+        planned = compute_planned_freedoms(scene, self.trajectory, hold, clock)
+        values, distance, angle = measure_hand(self.physical, data, hold, planned)
+        grip = Grip(str(hold), max(begin, first), min(end, last), distance=distance, angle=angle)
+        if not grip.missed:
+            self._engage(data, hold, values)
+            self._active[hold] = (len(self.grips), end)
+            self._forces[hold] = deque(maxlen=self._window)
+        self.grips.append(grip)
 
     def measure(self, data: Any, clock: float) -> None:
         """Record the load on the welds after a step, and release those that are overloaded."""
         if not self._active:
             return
-        kinds, owners = np.asarray(data.efc_type), np.asarray(data.efc_id)
+        is_equality = np.asarray(data.efc_type) == self._equality
+        owners = np.asarray(data.efc_id)
         for hold, (number, _) in list(self._active.items()):
-            rows = np.flatnonzero((kinds == self._equality) & (owners == self.holds.index(hold)))
+            rows = np.flatnonzero(is_equality & (owners == self.holds.index(hold)))
             forces = self._forces[hold]
-            # Rotational rows act on half angles, as quaternions do.
-            forces.append(np.asarray(data.efc_force)[rows] * [1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
+            forces.append(np.asarray(data.efc_force)[rows] * _WELD_SCALES)
             if len(forces) < self._window:
                 continue
             mean = np.mean(forces, axis=0)
-            force, torque = float(np.linalg.norm(mean[:3])), float(np.linalg.norm(mean[3:]))
+            force = float(np.linalg.norm(mean[:3]))
+            torque = float(np.linalg.norm(mean[3:]))
+            is_broken = force > self.physics.grasp_force or torque > self.physics.grasp_torque
             grip = self.grips[number]
-            broken = (
-                clock
-                if force > self.physics.grasp_force or torque > self.physics.grasp_torque
-                else None
-            )
             # Before, the servos settle under the load that is in the hand at the start.
-            if clock >= grip.begin or broken is not None:
+            if clock >= grip.begin or is_broken:
                 grip = replace(grip, force=max(force, grip.force), torque=max(torque, grip.torque))
-            self.grips[number] = replace(grip, broken=broken)
-            if broken is not None:
+            self.grips[number] = replace(grip, broken=clock if is_broken else None)
+            if is_broken:
                 self._release(data, hold)
 
     def preload(self, data: Any, settled: Any) -> None:
@@ -237,14 +248,16 @@ class Grips:
 
     def _measure_weld(self, data: Any, hold: Hold) -> pin.SE3:
         """Return the placement of the welded link's body in that of the holder."""
-        model, number = self.physical.model, self.holds.index(hold)
+        model = self.physical.model
+        number = self.holds.index(hold)
         holder = self.physical.place_body(data, int(model.eq_obj1id[number]))
         link = self.physical.place_body(data, int(model.eq_obj2id[number]))
         return holder.actInv(link)
 
     def _engage(self, data: Any, hold: Hold, freedoms: Sequence[float]) -> None:
         """Weld the holder to the link at their current relative placement."""
-        model, number = self.physical.model, self.holds.index(hold)
+        model = self.physical.model
+        number = self.holds.index(hold)
         if hold in self.physical.carriers:
             data.qpos[self.physical.carriers[hold]] = freedoms
             self._engine.mj_kinematics(model, data)
@@ -258,15 +271,18 @@ class Grips:
 
     def _set_target(self, hold: Hold, target: pin.SE3) -> None:
         """Set the placement of the welded link's body in that of the holder."""
-        model, number = self.physical.model, self.holds.index(hold)
+        model = self.physical.model
+        number = self.holds.index(hold)
         anchor = np.array(model.eq_data[number, :3])  # of the weld, in the link's body
         model.eq_data[number, 3:6] = target.act(anchor)
         model.eq_data[number, 6:10] = to_mujoco_quaternion(target)
         self._targets[hold] = target
 
     def _release(self, data: Any, hold: Hold) -> None:
+        """Open the hand."""
         data.eq_active[self.holds.index(hold)] = 0
-        del self._active[hold], self._forces[hold]
+        del self._active[hold]
+        del self._forces[hold]
         self._set_collision(hold, enabled=True)
 
     def _set_collision(self, hold: Hold, *, enabled: bool) -> None:
@@ -278,16 +294,21 @@ class Grips:
             return
         own = self.physical.geoms[(self.pairs.types & bit) != 0]
         types = self.physical.model.geom_contype
-        types[own] = types[own] | bit if enabled else types[own] & ~bit
+        if enabled:
+            types[own] |= bit
+        else:
+            types[own] &= ~bit
 
 
 def find_latches(scene: Scene) -> list[tuple[str, float, str, float]]:
     """Return joint, latched position, releasing joint and release threshold of each latch."""
-    return [
-        (f"{name}.{latch.joint}", latch.held_at, f"{name}.{latch.released_by}", latch.threshold)
-        for name, placed in scene.objects.items()
-        for latch in placed.object.latches
-    ]
+    found: list[tuple[str, float, str, float]] = []
+    for name, placed in scene.objects.items():
+        for latch in placed.object.latches:
+            joint = f"{name}.{latch.joint}"
+            release = f"{name}.{latch.released_by}"
+            found.append((joint, latch.held_at, release, latch.threshold))
+    return found
 
 
 class Latches:
@@ -300,17 +321,17 @@ class Latches:
         first: int,
         physics: Physics,
     ) -> None:
-        columns: Mapping[str, int] = dict(
-            zip(physical.world.coordinates.names, physical.columns.tolist(), strict=True)
-        )
+        names = physical.world.coordinates.names
+        columns = dict(zip(names, physical.columns.tolist(), strict=True))
         self._latches = [
-            (columns[joint], at, columns[by], threshold - physics.latch_play)
-            for joint, at, by, threshold in latches
+            (columns[joint], at, columns[release], threshold - physics.latch_play)
+            for joint, at, release, threshold in latches
         ]
         self._first = first
 
     def follow(self, data: Any) -> None:
         """Engage and release latches."""
-        for number, (joint, at, by, threshold) in enumerate(self._latches, self._first):
-            engaged = bool(data.eq_active[number]) or abs(data.qpos[joint] - at) <= _LATCH_TOLERANCE
-            data.eq_active[number] = engaged and data.qpos[by] < threshold
+        for number, (joint, at, release, threshold) in enumerate(self._latches, self._first):
+            is_at_latch = abs(data.qpos[joint] - at) <= _LATCH_TOLERANCE
+            is_engaged = bool(data.eq_active[number]) or is_at_latch
+            data.eq_active[number] = is_engaged and data.qpos[release] < threshold

@@ -21,10 +21,12 @@ from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-_MOTION_TOLERANCE = 1e-9  # [m] or [rad]
-RESOLUTION = 1e-3  # largest penetration that may be missed between two samples [m]
-MIN_MOTION = 1e-6  # smaller relative motions between two samples are ignored [m]
-_Part = tuple[float, float, float, float]  # begin and end of it, distances there [m]
+# [m] or [rad]
+_MOTION_TOLERANCE = 1e-9
+# largest penetration that may be missed between two samples [m]
+RESOLUTION = 1e-3
+# smaller relative motions between two samples are ignored [m]
+MIN_MOTION = 1e-6
 
 
 class PairTable:
@@ -51,41 +53,54 @@ class PairTable:
         windows: Sequence[Window] = (),
         samples: Samples | None = None,
     ) -> None:
-        self.scene, self.world, self.solids = scene, solids.world, solids
-        world, own_margin = self.world, dist_safe if self_distance is None else self_distance
+        self.scene = scene
+        self.world = solids.world
+        self.solids = solids
         samples = Samples(scene, trajectory) if samples is None else samples
-        lasts = [phase.last for phase in trajectory.phases]
-        self._moves = np.array(
-            [
-                self._find_moving_shapes(samples.z[samples.get_rows(phase)])
-                for phase in trajectory.phases
-            ]
-        )
-        self._phase = np.searchsorted(lasts, np.arange(len(trajectory.times)))  # the earlier of two
-        labels, bodies = world.collision_labels, range(solids.body_count)
-        owners = [label.partition(".")[0] if "." in label else "" for label in labels]
-        robots = len(scene.robot.collision.geometryObjects)
-        self.groups = [
-            "robot" if i < robots else name if name in scene.objects else ""
-            for i, name in enumerate(owners)
+        own_margin = dist_safe if self_distance is None else self_distance
+        robot_margins = scene.robot.own_margins(own_margin)
+        self._robot_pairs = {frozenset(pair): margin for pair, margin in robot_margins.items()}
+        self.groups = self._list_groups()
+        moves = [
+            self._find_moving_shapes(samples.z[samples.get_rows(phase)])
+            for phase in trajectory.phases
         ]
-        self._robot_pairs = {
-            frozenset(pair): own for pair, own in scene.robot.own_margins(own_margin).items()
-        }
+        self._moves = np.array(moves)
         self._ever_moves: Bools = np.asarray(self._moves.any(axis=0))
-        own = np.array(
-            [(i, j) for j in bodies for i in range(j) if self._can_collide(i, j)], int
-        ).reshape(-1, 2)
+        # The phase of each waypoint; of two, the earlier one.
+        lasts = [phase.last for phase in trajectory.phases]
+        self._phase = np.searchsorted(lasts, np.arange(len(trajectory.times)))
+        own = self._pair_bodies()
         self.pairs = np.concatenate([own, self._pair_with_obstacles()])
         if not len(self.pairs):
             raise InputError(
                 "no pair of geometries can collide", field="scene", expected="collision geometry"
             )
+        own_margins = [self._robot_pairs.get(frozenset(pair), dist_safe) for pair in own.tolist()]
         self.margins = np.full(len(self.pairs), float(dist_safe))
-        self.margins[: len(own)] = [
-            self._robot_pairs.get(frozenset(pair), dist_safe) for pair in own.tolist()
-        ]
+        self.margins[: len(own)] = own_margins
         self._windows = _WindowIndex(windows, self.pairs)
+
+    def _list_groups(self) -> list[str]:
+        """Return for each shape "robot", the name of its object, or "" for an obstacle."""
+        robot_size = len(self.scene.robot.collision.geometryObjects)
+        groups: list[str] = []
+        for i, label in enumerate(self.world.collision_labels):
+            owner, dot, _ = label.partition(".")
+            if i < robot_size:
+                groups.append("robot")
+            elif dot and owner in self.scene.objects:
+                groups.append(owner)
+            else:
+                groups.append("")
+        return groups
+
+    def _pair_bodies(self) -> Ints:
+        """Return the pairs of two bodies that can collide, shape (n, 2)."""
+        pairs: list[tuple[int, int]] = []
+        for j in range(self.solids.body_count):
+            pairs += [(i, j) for i in range(j) if self._can_collide(i, j)]
+        return np.array(pairs, int).reshape(-1, 2)
 
     def _find_moving_shapes(self, rows: Floats) -> Bools:
         """Return which shapes move in a sequence of configurations, shape (G,)."""
@@ -93,20 +108,22 @@ class PairTable:
         moved = world.coordinates.find_moved_joints(np.ptp(rows, axis=0) > _MOTION_TOLERANCE)
         for joint in range(1, len(moved)):
             moved[joint] |= moved[world.model.parents[joint]]
-        robots = len(self.scene.robot.collision.geometryObjects)
+        robot_size = len(self.scene.robot.collision.geometryObjects)
         return np.array(
-            [i < robots or moved[shape.parentJoint] for i, shape in enumerate(world.shapes)]
+            [i < robot_size or moved[shape.parentJoint] for i, shape in enumerate(world.shapes)]
         )
 
     def get_margins(self, pairs: Ints, waypoints: Ints) -> Floats:
         """Return the required clearances of pairs at waypoints, shape (n,) each [m]; -inf: none."""
-        margins, (k, which) = self.margins[pairs], self._windows.find(pairs, waypoints, waypoints)
+        margins = self.margins[pairs]
+        k, which = self._windows.find(pairs, waypoints, waypoints)
         np.minimum.at(margins, k, self._windows.margin[which])
         return margins
 
     def get_contact_overlaps(self, pairs: Ints, first: Ints, last: Ints) -> Floats:
         """Return the overlaps that count as contact from `first` to `last`, shape (n,) each [m]."""
-        overlap, (k, which) = np.zeros(len(pairs)), self._windows.find(pairs, first, last)
+        overlap = np.zeros(len(pairs))
+        k, which = self._windows.find(pairs, first, last)
         np.maximum.at(overlap, k, self._windows.contact[which])
         return overlap
 
@@ -119,44 +136,49 @@ class PairTable:
 
     def find_moving_together(self, pairs: Ints, first: Ints, last: Ints) -> Bools:
         """Return which pairs move rigidly together from `first` to `last`, shape (n,) each."""
-        as_one, (k, which) = np.zeros(len(pairs), bool), self._windows.find(pairs, first, last)
-        as_one[k[self._windows.moves_together[which]]] = True
-        return as_one
+        is_rigid = np.zeros(len(pairs), bool)
+        k, which = self._windows.find(pairs, first, last)
+        is_rigid[k[self._windows.moves_together[which]]] = True
+        return is_rigid
 
     def _can_collide(self, i: int, j: int) -> bool:
         """Return whether bodies i < j (robot first, then objects) can collide."""
-        a, b = self.groups[i], self.groups[j]
-        if a == "robot" and b == "robot":
+        first = self.groups[i]
+        second = self.groups[j]
+        if first == "robot" and second == "robot":
             return frozenset((i, j)) in self._robot_pairs
-        if a == "robot":
+        if first == "robot":
             return True
-        if a == b:  # self-collision of an object
-            links = frozenset(self.world.collision_labels[k].partition(".")[2] for k in (i, j))
-            return links in self.scene.objects[a].object.own_pairs
+        if first == second:  # self-collision of an object
+            labels = self.world.collision_labels
+            links = frozenset((labels[i].partition(".")[2], labels[j].partition(".")[2]))
+            return links in self.scene.objects[first].object.own_pairs
         return bool(self._ever_moves[i] or self._ever_moves[j])
 
     def _pair_with_obstacles(self) -> Ints:
-        """Return the pairs of moving bodies with obstacles, shape (n, 2), by obstacle."""
-        bodies, labels = range(self.solids.body_count), self.world.collision_labels
-        joints = [self.world.shapes[i].parentJoint for i in bodies]
-        moving = [i for i in bodies if self._ever_moves[i]]
-        # Wheels touch the floor, and mounted objects may.
-        free = {name for name, placed in self.scene.objects.items() if placed.object.free}
-        above = [
-            i
-            for i in moving
-            if self.groups[i] in free or (self.groups[i] == "robot" and joints[i] > 1)
-        ]
-        obstacles = range(self.solids.body_count, len(labels))
-        found = [np.zeros((0, 2), int)]
-        for floor, ones in ((False, moving), (True, above)):
-            others = [j for j in obstacles if (labels[j] == FLOOR) == floor]
-            found.append(
-                np.column_stack(
-                    [np.tile(np.array(ones, int), len(others)), np.repeat(others, len(ones))]
-                )
-            )
-        return np.concatenate(found).astype(int)
+        """Return the pairs of moving bodies with obstacles, shape (n, 2), by obstacle.
+
+        Those with the floor come last.
+        """
+        labels = self.world.collision_labels
+        moving = [i for i in range(self.solids.body_count) if self._ever_moves[i]]
+        over_floor = [i for i in moving if self._must_clear_floor(i)]
+        obstacles: list[int] = []
+        floors: list[int] = []
+        for j in range(self.solids.body_count, len(labels)):
+            if labels[j] == FLOOR:
+                floors.append(j)
+            else:
+                obstacles.append(j)
+        pairs = [_pair_all(moving, obstacles), _pair_all(over_floor, floors)]
+        return np.concatenate(pairs)
+
+    def _must_clear_floor(self, body: int) -> bool:
+        """Return whether a body may not touch the floor, as wheels do, and mounted objects may."""
+        group = self.groups[body]
+        if group == "robot":
+            return bool(self.world.shapes[body].parentJoint > 1)
+        return group in self.scene.objects and self.scene.objects[group].object.free
 
     def find_close_pairs(
         self, placed: PlacedShapes, first: Ints, last: Ints, moved: Floats, limit: float
@@ -182,38 +204,47 @@ class _WindowIndex:
     """An index of windows for vectorized queries, with their properties as arrays."""
 
     def __init__(self, windows: Sequence[Window], pairs: Ints) -> None:
-        most = max((int(window.pairs.max()) for window in windows if len(window.pairs)), default=0)
-        base = np.array([max(most, int(pairs.max())) + 1, 1])
-        numbers, rows = pairs @ base, [np.zeros((0, 2), int)]  # a unique number for each pair
-        order = np.argsort(numbers)
-        for w, window in enumerate(windows):
-            wanted = window.pairs @ base
-            at = order[np.minimum(np.searchsorted(numbers, wanted, sorter=order), len(order) - 1)]
-            rows.append(np.column_stack([at, np.full(len(at), w)])[numbers[at] == wanted])
-        found = np.concatenate(rows)
-        of_pair, self._which = found[np.lexsort((found[:, 1], found[:, 0]))].T
+        self._first = np.array([window.first for window in windows], int)
+        self._last = np.array([window.last for window in windows], int)
+        self.margin = np.array([window.margin for window in windows], float)
+        self.contact = np.array([window.contact for window in windows], float)
+        self.moves_together = np.array([window.moves_together for window in windows], bool)
+        self.is_exempt = np.array([window.is_exempt for window in windows], bool)
+        # The windows of pair p are `_which[_begin[p] : _begin[p] + _count[p]]`.
+        listed = self._list_windows(windows, pairs)
+        of_pair, self._which = listed[np.lexsort((listed[:, 1], listed[:, 0]))].T
         self._count = np.bincount(of_pair, minlength=len(pairs))
         self._begin = np.cumsum(self._count) - self._count
-        self._first, self._last = (
-            np.array([getattr(window, end) for window in windows], int) for end in ("first", "last")
-        )
-        self.margin, self.contact = (
-            np.array([getattr(w, name) for w in windows], float) for name in ("margin", "contact")
-        )
-        self.moves_together, self.is_exempt = (
-            np.array([getattr(w, name) for w in windows], bool)
-            for name in ("moves_together", "is_exempt")
-        )
+
+    @staticmethod
+    def _list_windows(windows: Sequence[Window], pairs: Ints) -> Ints:
+        """Return (pair, window) for each known pair of each window, shape (n, 2)."""
+        largest = int(pairs.max())
+        for window in windows:
+            if len(window.pairs):
+                largest = max(largest, int(window.pairs.max()))
+        base = np.array([largest + 1, 1])
+        numbers = pairs @ base  # unique for each pair
+        order = np.argsort(numbers)
+        rows = [np.zeros((0, 2), int)]
+        for w, window in enumerate(windows):
+            wanted = window.pairs @ base
+            places = np.searchsorted(numbers, wanted, sorter=order)
+            at = order[np.minimum(places, len(order) - 1)]
+            is_known = numbers[at] == wanted
+            rows.append(np.column_stack([at, np.full(len(at), w)])[is_known])
+        return np.concatenate(rows)
 
     def find(self, pairs: Ints, first: Ints, last: Ints) -> tuple[Ints, Ints]:
         """Return (k, window) for all windows of pair k that cover waypoints `first` to `last`."""
         some = np.flatnonzero(self._count[pairs])
         count = self._count[pairs[some]]
         k = np.repeat(some, count)
-        place = np.repeat(self._begin[pairs[some]] - np.cumsum(count) + count, count)
-        which = self._which[place + np.arange(len(k))]
-        holds = (self._first[which] <= first[k]) & (last[k] <= self._last[which])
-        return k[holds], which[holds]
+        # Row n of the result is window n − (rows of earlier pairs) of its pair.
+        offsets = np.repeat(self._begin[pairs[some]] - np.cumsum(count) + count, count)
+        which = self._which[offsets + np.arange(len(k))]
+        is_covered = (self._first[which] <= first[k]) & (last[k] <= self._last[which])
+        return k[is_covered], which[is_covered]
 
 
 class Hit(NamedTuple):
@@ -247,39 +278,41 @@ def sweep(table: PairTable, z: Floats, waypoints: Ints) -> Iterator[Hit]:
 
 
 class _Sweep:
+    """Searches a motion for close pairs, at waypoints and then between them."""
+
     def __init__(self, table: PairTable) -> None:
-        self._table, self._solids = table, table.solids
+        self._table = table
+        self._solids = table.solids
         self._waypoints = np.zeros(0, int)
 
     def find_hits(self, z: Floats, waypoints: Ints) -> Iterator[Hit]:
-        placed = self._solids.place(self._solids.world.coordinates.q(z[waypoints]))
+        self._waypoints = waypoints
+        placed = self._place(z[waypoints])
         at, pairs, distances = self._find_nearest(placed)
-        self._waypoints, margins = waypoints, self._table.get_margins(pairs, at)
+        margins = self._table.get_margins(pairs, at)
         apart = np.flatnonzero(margins > -np.inf)  # pairs that do not move together
         closest = apart[_find_group_minima(at[apart], distances[apart])]
-        exempt = self._table.find_exempt(pairs, at) & (distances < self._table.margins[pairs])
-        chosen = np.union1d(
-            closest, np.flatnonzero((distances < np.maximum(margins, 0.0)) | exempt)
-        )
+        is_exempt = self._table.find_exempt(pairs, at) & (distances < self._table.margins[pairs])
+        is_close = distances < np.maximum(margins, 0.0)
+        chosen = np.union1d(closest, np.flatnonzero(is_close | is_exempt))
         yield from self._make_hits(
             waypoints[at[chosen]], pairs[chosen], distances[chosen], at_waypoint=True
         )
         # Pairs that stay further apart do not affect the report.
         smallest = max(RESOLUTION, float(distances[closest].min(initial=np.inf)))
         moved = bound_displacements(self._solids, z)
-        stretch, pairs = self._find_active_pairs(
+        segments, pairs = self._find_active_pairs(
             placed, np.diff(moved[waypoints], axis=0), smallest
         )
-        ends = placed.compute_distances(
-            np.concatenate([stretch, stretch + 1]), np.tile(self._table.pairs[pairs], (2, 1))
-        )
-        before, after = np.split(ends, 2)
-        yield from self._search_intervals(
-            z,
-            Intervals(waypoints[stretch], waypoints[stretch + 1], pairs, before, after),
-            moved,
-            smallest,
-        )
+        both_ends = np.concatenate([segments, segments + 1])
+        both_pairs = np.tile(self._table.pairs[pairs], (2, 1))
+        before, after = np.split(placed.compute_distances(both_ends, both_pairs), 2)
+        intervals = Intervals(waypoints[segments], waypoints[segments + 1], pairs, before, after)
+        yield from self._search_intervals(z, intervals, moved, smallest)
+
+    def _place(self, z: Floats) -> PlacedShapes:
+        """Place the shapes at configurations of the world, shape (W, n)."""
+        return self._solids.place(self._solids.world.coordinates.q(z))
 
     def _search_intervals(
         self, z: Floats, todo: Intervals, moved: Floats, smallest: float
@@ -292,20 +325,19 @@ class _Sweep:
         """
         while len(todo.pair):
             motion = self._bound_motion(todo, moved)
-            todo = todo.select(
-                (todo.before + todo.after - motion < 2 * smallest)
-                & ((motion > MIN_MOTION) | (todo.before < 0))
-            )
-            next_to = todo.high - todo.low == 1
-            yield from self._find_tunnelling(z, todo.select(next_to), moved)
-            todo = todo.select(~next_to)
+            may_be_close = todo.before + todo.after - motion < 2 * smallest
+            may_change = (motion > MIN_MOTION) | (todo.before < 0)
+            todo = todo.select(may_be_close & may_change)
+            is_adjacent = todo.high - todo.low == 1
+            yield from self._find_tunnelling(z, todo.select(is_adjacent), moved)
+            todo = todo.select(~is_adjacent)
             middle = (todo.low + todo.high) // 2
             rows, at = np.unique(middle, return_inverse=True)
-            distances = self._solids.place(
-                self._solids.world.coordinates.q(z[rows])
-            ).compute_distances(at, self._table.pairs[todo.pair])
-            told = np.union1d(_find_group_minima(at, distances), np.flatnonzero(distances < 0))
-            yield from self._make_hits(middle[told], todo.pair[told], distances[told])
+            pairs = self._table.pairs[todo.pair]
+            distances = self._place(z[rows]).compute_distances(at, pairs)
+            overlapping = np.flatnonzero(distances < 0)
+            chosen = np.union1d(_find_group_minima(at, distances), overlapping)
+            yield from self._make_hits(middle[chosen], todo.pair[chosen], distances[chosen])
             todo = Intervals(
                 np.append(todo.low, middle),
                 np.append(middle, todo.high),
@@ -317,64 +349,70 @@ class _Sweep:
     def _bound_motion(self, todo: Intervals, moved: Floats) -> Floats:
         """Bound the relative motion of pairs in intervals, shape (n,) [m]."""
         first, second = self._table.pairs[todo.pair].T
-        return (moved[todo.high, first] - moved[todo.low, first]) + (
-            moved[todo.high, second] - moved[todo.low, second]
-        )
+        first_motion = moved[todo.high, first] - moved[todo.low, first]
+        second_motion = moved[todo.high, second] - moved[todo.low, second]
+        return first_motion + second_motion
 
     def _find_tunnelling(self, z: Floats, todo: Intervals, moved: Floats) -> Iterator[Hit]:
         """Yield pairs that overlap between two adjacent samples, but at neither of them.
 
         Penetrations deeper than `RESOLUTION` are never missed.
         """
-        first, motion = self._find_interval(todo.low), self._bound_motion(todo, moved)
-        overlap = self._table.get_contact_overlaps(todo.pair, first, first + 1)
-        free = (np.minimum(todo.before, todo.after) >= -overlap) & (
-            todo.before + todo.after < motion
-        )
-        free &= ~self._table.find_moving_together(todo.pair, first, first + 1)
-        stacks = {
-            c: [(0.0, 1.0, float(todo.before[c]), float(todo.after[c]))]
-            for c in np.flatnonzero(free).tolist()
-        }
+        first = self._find_interval(todo.low)
+        motion = self._bound_motion(todo, moved)
+        contact = self._table.get_contact_overlaps(todo.pair, first, first + 1)
+        is_free_at_ends = np.minimum(todo.before, todo.after) >= -contact
+        may_overlap = todo.before + todo.after < motion
+        is_rigid = self._table.find_moving_together(todo.pair, first, first + 1)
+        searched = np.flatnonzero(is_free_at_ends & may_overlap & ~is_rigid)
+        # The parts of each interval that are still to be searched.
+        stacks: dict[int, list[_Part]] = {}
+        for k in searched.tolist():
+            stacks[k] = [_Part(0.0, 1.0, float(todo.before[k]), float(todo.after[k]))]
         while True:  # one step of the search of every interval at once
-            steps = {c: step for c in stacks if (step := _pop_open_part(stacks[c], motion[c]))}
-            if not steps:
+            parts: dict[int, _Part] = {}
+            for k, stack in stacks.items():
+                part = _pop_open_part(stack, motion[k])
+                if part is not None:
+                    parts[k] = part
+            if not parts:
                 return
-            which = np.array(list(steps))
-            middle = np.array([(low + high) / 2 for low, high, _, _ in steps.values()])
+            which = np.array(list(parts))
+            middle = np.array([(part.begin + part.end) / 2 for part in parts.values()])
             places, at = np.unique([todo.low[which], middle], axis=1, return_inverse=True)
-            rows, share = places[0].astype(int), places[1][:, None]
-            found = self._solids.place(
-                self._solids.world.coordinates.q((1 - share) * z[rows] + share * z[rows + 1])
-            ).compute_distances(at.ravel(), self._table.pairs[todo.pair[which]])
-            yield from self._make_hits(todo.low[which], todo.pair[which], found)
-            for (c, step), half, between in zip(
-                steps.items(), middle.tolist(), found.tolist(), strict=True
-            ):
-                low, high, before, after = step
-                if between < -overlap[c]:
-                    del stacks[c]
+            rows = places[0].astype(int)
+            fraction = places[1][:, None]
+            placed = self._place((1 - fraction) * z[rows] + fraction * z[rows + 1])
+            pairs = self._table.pairs[todo.pair[which]]
+            distances = placed.compute_distances(at.ravel(), pairs)
+            yield from self._make_hits(todo.low[which], todo.pair[which], distances)
+            for k, half, distance in zip(parts, middle.tolist(), distances.tolist(), strict=True):
+                if distance < -contact[k]:
+                    del stacks[k]
                 else:
-                    stacks[c] += [(low, half, before, between), (half, high, between, after)]
+                    stacks[k] += parts[k].split(half, distance)
 
     def _find_nearest(self, placed: PlacedShapes) -> tuple[Ints, Ints, Floats]:
         """Return states, pairs and distances [m] of the closest pairs and all below margins."""
-        found, todo = list[tuple[Ints, Ints, Floats]](), np.arange(len(placed))
+        found: list[tuple[Ints, Ints, Floats]] = []
         reach = max(self._table.margins.max(), RESOLUTION)
+        todo = np.arange(len(placed))  # states whose closest pair is not known
         while len(todo):
-            at, pairs = self._table.find_close_pairs(
-                placed, todo, todo, np.zeros((len(todo), len(self._table.groups))), reach
-            )
+            at_rest = np.zeros((len(todo), len(self._table.groups)))
+            at, pairs = self._table.find_close_pairs(placed, todo, todo, at_rest, reach)
             states = todo[at]
             distances = placed.compute_distances(states, self._table.pairs[pairs])
-            least = np.full(len(placed), np.inf)
-            apart = self._table.get_margins(pairs, states) > -np.inf
-            np.minimum.at(least, states[apart], distances[apart])
-            done = ~(least > reach)  # all other pairs are further apart
-            kept = done[states]
-            found.append((states[kept], pairs[kept], distances[kept]))
-            todo, reach = todo[~done[todo]], 2.0 * reach
-        states, pairs, distances = (np.concatenate(parts) for parts in zip(*found, strict=True))
+            smallest = np.full(len(placed), np.inf)
+            is_apart = self._table.get_margins(pairs, states) > -np.inf
+            np.minimum.at(smallest, states[is_apart], distances[is_apart])
+            is_done = ~(smallest > reach)  # all other pairs are further apart
+            is_kept = is_done[states]
+            found.append((states[is_kept], pairs[is_kept], distances[is_kept]))
+            todo = todo[~is_done[todo]]
+            reach = 2.0 * reach
+        states = np.concatenate([part[0] for part in found])
+        pairs = np.concatenate([part[1] for part in found])
+        distances = np.concatenate([part[2] for part in found])
         order = np.lexsort((pairs, states))
         return states[order], pairs[order], distances[order]
 
@@ -386,9 +424,8 @@ class _Sweep:
         By the bound of `_search_intervals`, the distance at one of both ends is then less than
         `smallest` plus half the relative motion.
         """
-        return self._table.find_close_pairs(
-            placed, np.arange(len(moved)), np.arange(1, len(moved) + 1), moved, smallest
-        )
+        begin = np.arange(len(moved))
+        return self._table.find_close_pairs(placed, begin, begin + 1, moved, smallest)
 
     def _find_interval(self, rows: Ints) -> Ints:
         """Return the last waypoint at or before each sample, shape (n,)."""
@@ -398,18 +435,22 @@ class _Sweep:
         self, rows: Ints, pairs: Ints, distances: Floats, *, at_waypoint: bool = False
     ) -> Iterator[Hit]:
         at = self._find_interval(rows)
+        labels = self._solids.world.collision_labels
         margins = self._table.get_margins(pairs, at)
         contacts = self._table.get_contact_overlaps(pairs, at, at if at_waypoint else at + 1)
-        labels = self._solids.world.collision_labels
-        exempt_clearance = np.where(
-            self._table.find_exempt(pairs, at), self._table.margins[pairs], 0.0
-        )
-        columns = (rows, self._table.pairs[pairs], distances, margins, contacts, exempt_clearance)
-        for row, (i, j), distance, margin, contact, clearance in zip(
-            *(c.tolist() for c in columns), strict=True
-        ):
+        is_exempt = self._table.find_exempt(pairs, at)
+        exempt_clearances = np.where(is_exempt, self._table.margins[pairs], 0.0)
+        for n, (i, j) in enumerate(self._table.pairs[pairs].tolist()):
             yield Hit(
-                row, labels[i], labels[j], distance, margin, contact, at_waypoint, clearance, (i, j)
+                row=int(rows[n]),
+                first=labels[i],
+                second=labels[j],
+                distance=float(distances[n]),
+                margin=float(margins[n]),
+                contact=float(contacts[n]),
+                at_waypoint=at_waypoint,
+                exempt_clearance=float(exempt_clearances[n]),
+                shapes=(i, j),
             )
 
 
@@ -433,17 +474,46 @@ class Intervals(NamedTuple):
         )
 
 
+class _Part(NamedTuple):
+    """A part of an interval between two samples, for one pair.
+
+    Attributes:
+        begin, end: Its ends, as fractions of the interval.
+        before, after: Distances of the pair there [m].
+    """
+
+    begin: float
+    end: float
+    before: float
+    after: float
+
+    def split(self, at: float, distance: float) -> tuple[_Part, _Part]:
+        """Return the parts before and after a fraction, at which the distance is known."""
+        earlier = _Part(self.begin, at, self.before, distance)
+        later = _Part(at, self.end, distance, self.after)
+        return earlier, later
+
+
 def _pop_open_part(stack: list[_Part], motion: float) -> _Part | None:
     """Pop the next part of an interval in which a pair may overlap unseen; None without any."""
     while stack:
-        low, high, before, after = part = stack.pop()
-        width = (high - low) * motion
-        if width > 2 * RESOLUTION and before + after < width:
+        part = stack.pop()
+        motion_in_part = (part.end - part.begin) * motion
+        may_overlap = part.before + part.after < motion_in_part
+        if motion_in_part > 2 * RESOLUTION and may_overlap:
             return part
     return None
+
+
+def _pair_all(ones: Sequence[int], others: Sequence[int]) -> Ints:
+    """Return all pairs of two lists, shape (n, 2), by the second one."""
+    first = np.tile(np.array(ones, int), len(others))
+    second = np.repeat(np.array(others, int), len(ones))
+    return np.column_stack([first, second])
 
 
 def _find_group_minima(groups: Ints, values: Floats) -> Ints:
     """Return the index of the first smallest value of each group."""
     order = np.lexsort((values, groups))
-    return order[np.flatnonzero(np.diff(groups[order], prepend=-1))]
+    is_first = np.diff(groups[order], prepend=-1)
+    return order[np.flatnonzero(is_first)]

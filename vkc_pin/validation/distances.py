@@ -20,7 +20,8 @@ from vkc_pin.world.models.coordinates import MovedJoint
 from vkc_pin.world.models.shapes import compute_bounding_box, compute_shape_distance
 from vkc_pin.world.trajectory.world_model import World
 
-POINT_RADIUS = 1e-4  # radius of the sphere that stands for a point [m]
+# radius of the sphere that stands for a point [m]
+POINT_RADIUS = 1e-4
 
 
 class CollisionShapes:
@@ -31,14 +32,16 @@ class CollisionShapes:
     """
 
     def __init__(self, world: World) -> None:
-        self.world, self.body_count = world, len(world.bodies.geometryObjects)
+        self.world = world
+        self.body_count = len(world.bodies.geometryObjects)
         boxes = [compute_bounding_box(shape) for shape in world.shapes]
         self.center = np.array([center for center, _ in boxes]).reshape(-1, 3)
         self.half = np.array([half for _, half in boxes]).reshape(-1, 3)
         obstacles = slice(self.body_count, None)
-        where = [shape.placement for shape in world.shapes[obstacles]]
-        self.distance_queries = Shapes([shape.geometry for shape in world.shapes], where)
-        self.obstacle_corners = self.compute_corners(flatten_placements(where), obstacles)
+        placements = [shape.placement for shape in world.shapes[obstacles]]
+        geometries = [shape.geometry for shape in world.shapes]
+        self.distance_queries = Shapes(geometries, placements)
+        self.obstacle_corners = self.compute_corners(flatten_placements(placements), obstacles)
         self._placements = ShapePlacements(world.model, world.bodies)
 
     def place(self, q: Floats) -> PlacedShapes:
@@ -48,7 +51,8 @@ class CollisionShapes:
     def compute_corners(self, where: Floats, which: slice) -> tuple[Floats, Floats]:
         """Compute lower and upper corners of axis-aligned boxes, shape (..., k, 3) each [m].
 
-        `where` are the shapes' placements in the world, shape (..., k, 12).
+        `where` are the shapes' placements in the world, shape (..., k, 12). A box with half sides h
+        in its own frame has the half sides |R| h along the axes of the world.
         """
         rotation = where[..., :9].reshape(*where.shape[:-1], 3, 3).swapaxes(-1, -2)
         middle = np.einsum("...ij,...j->...i", rotation, self.center[which]) + where[..., 9:]
@@ -60,28 +64,27 @@ class PlacedShapes:
     """The shapes at W configurations, with the bodies' placements `where`, shape (W, M, 12)."""
 
     def __init__(self, solids: CollisionShapes, where: Floats) -> None:
-        self._solids, self._where = solids, where
+        self._solids = solids
+        self._where = where
 
     @cached_property
     def corners(self) -> tuple[Floats, Floats]:
         """Lower and upper corners of all axis-aligned boxes, shape (W, G, 3) each [m]."""
-        bodies = self._solids.compute_corners(self._where, slice(self._solids.body_count))
-        obstacles = (
-            np.broadcast_to(part, (len(self._where), *part.shape))
-            for part in self._solids.obstacle_corners
-        )
-        lower, upper = (
-            np.concatenate(parts, axis=1) for parts in zip(bodies, obstacles, strict=True)
-        )
+        body_lower, body_upper = self._compute_body_corners()
+        obstacle_lower, obstacle_upper = self._solids.obstacle_corners
+        shape = (len(self._where), *obstacle_lower.shape)
+        lower = np.concatenate([body_lower, np.broadcast_to(obstacle_lower, shape)], axis=1)
+        upper = np.concatenate([body_upper, np.broadcast_to(obstacle_upper, shape)], axis=1)
         return lower, upper
 
     @cached_property
     def boxes(self) -> WorldBoxes:
         """The axis-aligned boxes, prepared for proximity queries."""
-        return WorldBoxes(
-            *self._solids.compute_corners(self._where, slice(self._solids.body_count)),
-            *self._solids.obstacle_corners,
-        )
+        return WorldBoxes(*self._compute_body_corners(), *self._solids.obstacle_corners)
+
+    def _compute_body_corners(self) -> tuple[Floats, Floats]:
+        """Compute the corners of the bodies' axis-aligned boxes, shape (W, M, 3) each [m]."""
+        return self._solids.compute_corners(self._where, slice(self._solids.body_count))
 
     def __len__(self) -> int:
         """Return W."""
@@ -99,9 +102,9 @@ class PlacedShapes:
             lower[states, first] - upper[states, second],
         )
         outside = np.maximum(gaps, 0.0)
-        return np.where(
-            gaps.max(axis=1) > 0.0, np.sqrt(np.einsum("ni,ni->n", outside, outside)), -np.inf
-        )
+        distances = np.sqrt(np.einsum("ni,ni->n", outside, outside))
+        is_apart = gaps.max(axis=1) > 0.0
+        return np.where(is_apart, distances, -np.inf)
 
     def compute_distances(self, states: Ints, pairs: Ints) -> Floats:
         """Compute signed distances [m] of pairs, shape (n, 2), at states, shape (n,)."""
@@ -112,13 +115,16 @@ class PlacedShapes:
 
         Only pairs that could be the nearest are passed to coal.
         """
-        states, count = len(self._where), len(pairs)
-        at, which = np.repeat(np.arange(states), count), np.tile(np.arange(count), states)
+        state_count = len(self._where)
+        pair_count = len(pairs)
+        # One row for each state and pair, by state and lower bound.
+        at = np.repeat(np.arange(state_count), pair_count)
+        which = np.tile(np.arange(pair_count), state_count)
         bounds = self.compute_lower_bounds(at, pairs[which])
         order = np.lexsort((which, bounds, at))
         chosen, found = self._solids.distance_queries.find_closest_pairs(
             self._where,
-            np.arange(states + 1) * count,
+            np.arange(state_count + 1) * pair_count,
             pairs[which[order]],
             ranks=np.arange(len(order)),
             margins=np.zeros(len(order)),
@@ -134,22 +140,22 @@ class PlacedShapes:
 
         The point is a sphere with a radius of 0.1 mm.
         """
-        lower, upper = (corners[0] for corners in self.corners)
-        near = np.flatnonzero(
-            ((lower - point < reach + POINT_RADIUS) & (point - upper < reach + POINT_RADIUS)).all(
-                axis=1
-            )
-        ).tolist()
+        lower = self.corners[0][0]
+        upper = self.corners[1][0]
+        margin = reach + POINT_RADIUS
+        is_near = (lower - point < margin) & (point - upper < margin)
         ball = coal.Sphere(POINT_RADIUS)
-        here = pin.SE3(np.eye(3), point)
-        shapes = self._solids.world.shapes
-        return [
-            i
-            for i in near
-            if compute_shape_distance(ball, here, shapes[i].geometry, self._placement(i)) < reach
-        ]
+        placement = pin.SE3(np.eye(3), point)
+        found: list[int] = []
+        for i in np.flatnonzero(is_near.all(axis=1)).tolist():
+            geometry = self._solids.world.shapes[i].geometry
+            distance = compute_shape_distance(ball, placement, geometry, self._get_placement(i))
+            if distance < reach:
+                found.append(i)
+        return found
 
-    def _placement(self, shape: int) -> pin.SE3:
+    def _get_placement(self, shape: int) -> pin.SE3:
+        """Return the placement of a shape at the first state."""
         if shape >= self._solids.body_count:
             return self._solids.world.shapes[shape].placement
         numbers = self._where[0, shape]
@@ -164,40 +170,48 @@ def bound_displacements(solids: CollisionShapes, samples: Floats) -> Floats:
     prismatic joint adds its travel.
     """
     world = solids.world
-    model, steps = world.model, np.abs(np.diff(samples, axis=0))
-    spans = np.linalg.norm(steps[:, :2], axis=1)
+    model = world.model
+    steps = np.abs(np.diff(samples, axis=0))
+    planar_steps = np.linalg.norm(steps[:, :2], axis=1)
     offsets = [float(np.linalg.norm(placement.translation)) for placement in model.jointPlacements]
     of_joint: dict[int, list[MovedJoint]] = {}
     for move in world.coordinates.moves:
         of_joint.setdefault(move.joint, []).append(move)
-    found = np.zeros((len(samples), len(world.shapes)))
+    bounds = np.zeros((len(samples), len(world.shapes)))
     for g, shape in enumerate(world.shapes[: solids.body_count]):
-        reach = float(np.linalg.norm(solids.half[g])) + float(
-            np.linalg.norm(shape.placement.act(solids.center[g]))
-        )
-        joint, moved = shape.parentJoint, np.zeros(len(steps))
+        # Distance within which all points of the shape are from the joint's origin [m].
+        radius = float(np.linalg.norm(solids.half[g]))
+        reach = radius + float(np.linalg.norm(shape.placement.act(solids.center[g])))
+        moved = np.zeros(len(steps))
+        joint = shape.parentJoint
         while joint:
             moves = of_joint[joint]
-            column, share, offset = moves[0].coordinate, abs(moves[0].factor), moves[0].offset
+            first = moves[0]
+            column = first.coordinate
             if len(moves) == 7:  # the free joint of a free object
-                moved += _bound_free_displacements(
-                    samples[:, [move.coordinate for move in moves]], reach
-                )
+                columns = [move.coordinate for move in moves]
+                moved += _bound_free_displacements(samples[:, columns], reach)
             elif len(moves) == 3:  # the planar base
-                moved += spans + steps[:, moves[2].coordinate] * reach
-            elif moves[0].slides:
-                moved += share * steps[:, column]
-                reach += float(np.abs(moves[0].factor * samples[:, column] + offset).max())
+                moved += planar_steps + steps[:, moves[2].coordinate] * reach
+            elif first.slides:
+                moved += abs(first.factor) * steps[:, column]
+                travel = np.abs(first.factor * samples[:, column] + first.offset)
+                reach += float(travel.max())
             else:
-                moved += share * steps[:, column] * reach
+                moved += abs(first.factor) * steps[:, column] * reach
             reach += offsets[joint]
             joint = model.parents[joint]
-        np.cumsum(moved, out=found[1:, g])
-    return found
+        np.cumsum(moved, out=bounds[1:, g])
+    return bounds
 
 
 def _bound_free_displacements(samples: Floats, reach: float) -> Floats:
-    """Bound the motion of points within `reach` [m] of a free joint between samples [m]."""
-    turns = samples[:, 3:] / np.linalg.norm(samples[:, 3:], axis=1, keepdims=True)
-    half = np.arccos(np.clip(np.abs(np.einsum("kc,kc->k", turns[1:], turns[:-1])), 0.0, 1.0))
-    return np.asarray(np.linalg.norm(np.diff(samples[:, :3], axis=0), axis=1) + 2.0 * half * reach)
+    """Bound the motion of points within `reach` [m] of a free joint between samples [m].
+
+    Two unit quaternions p and q differ by a rotation of 2 arccos |p · q|.
+    """
+    shifts = np.linalg.norm(np.diff(samples[:, :3], axis=0), axis=1)
+    quaternions = samples[:, 3:] / np.linalg.norm(samples[:, 3:], axis=1, keepdims=True)
+    products = np.einsum("kc,kc->k", quaternions[1:], quaternions[:-1])
+    half_angles = np.arccos(np.clip(np.abs(products), 0.0, 1.0))
+    return np.asarray(shifts + 2.0 * half_angles * reach)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arguments import check_choice
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.tolerances import Tolerances
@@ -27,7 +28,8 @@ from vkc_pin.world.task.steps import (
     Touch,
 )
 
-MOTION_TOLERANCE = 1e-5  # smaller displacements do not count as motion [m] or [rad]
+# smaller displacements do not count as motion [m] or [rad]
+MOTION_TOLERANCE = 1e-5
 
 
 class GoalError(NamedTuple):
@@ -50,9 +52,9 @@ def check_steps(samples: Samples, steps: Sequence[Step]) -> None:
         if isinstance(step, Actuate | Grasp | Place | Release):
             if step.object is not None:
                 _check_object_step(samples, step, where)
-        elif isinstance(step, Touch) and step.frame.partition(".")[0] in samples.scene.objects:
+        elif isinstance(step, Touch) and _get_owner(step.frame) in samples.scene.objects:
             samples.check_frame(step.frame, f"{where}.frame")
-            _check_attachment(samples, step.frame.partition(".")[0], step.attachment, where)
+            _check_attachment(samples, _get_owner(step.frame), step.attachment, where)
         elif isinstance(step, Configure):
             joints = samples.scene.robot.planned_joints
             for joint in step.joints:
@@ -60,6 +62,11 @@ def check_steps(samples: Samples, steps: Sequence[Step]) -> None:
         elif isinstance(step, Reach | Touch) and step.frame is not None:
             frames = samples.scene.robot.frame_names
             check_choice(step.frame, frames, "frame of the robot", f"{where}.frame")
+
+
+def _get_owner(name: str) -> str:
+    """Return the object of a name "<object>.<link>" or "<object>.<joint>"."""
+    return name.partition(".")[0]
 
 
 def _check_object_step(
@@ -73,14 +80,15 @@ def _check_object_step(
     if isinstance(step, Grasp) and step.by is not None:
         samples.check_frame(step.by, f"{where}.by")
     _check_attachment(samples, name, step.attachment, where)
-    for joint in step.joints if isinstance(step, Actuate) else ():
-        check_choice(joint, item.coordinates.names, f"joint of '{name}'", f"{where}.joints")
+    if isinstance(step, Actuate):
+        for joint in step.joints:
+            check_choice(joint, item.coordinates.names, f"joint of '{name}'", f"{where}.joints")
 
 
 def _check_attachment(samples: Samples, name: str, attachment: str | None, where: str) -> None:
     if attachment is not None:
-        known, kind = samples.scene.objects[name].object.attachments, f"attachment of '{name}'"
-        check_choice(attachment, known, kind, f"{where}.attachment")
+        known = samples.scene.objects[name].object.attachments
+        check_choice(attachment, known, f"attachment of '{name}'", f"{where}.attachment")
 
 
 def check_goals(samples: Samples, steps: Sequence[Step], tolerances: Tolerances) -> list[Violation]:
@@ -93,136 +101,159 @@ def check_goals(samples: Samples, steps: Sequence[Step], tolerances: Tolerances)
     """
     phases = samples.trajectory.phases
     ends = [0, *(phase.last for phase in phases)]  # a goal may hold at the start
-    hands = find_grasped_objects(samples, steps)
-    misses = [
-        [
-            _compute_goal_errors(samples, step, k, tolerances)
-            + _find_missing_grasps(samples, steps, hands, number, k)
-            for k in range(len(ends))
+    grasped = find_grasped_objects(samples, steps)
+    last_step = len(steps) - 1
+    found: list[Violation] = []
+    holds: list[list[bool]] = []
+    reached = 0  # the number of phases after which the goal of the step before holds first
+    for number, step in enumerate(steps):
+        misses = [
+            _compute_goal_errors(samples, step, end, tolerances)
+            + _find_missing_grasps(samples, steps, grasped, number, end)
+            for end in range(len(ends))
         ]
-        for number, step in enumerate(steps)
-    ]
-    found, reached = [], 0
-    for number in range(len(steps)):
-        candidates = [len(ends) - 1] if number == len(steps) - 1 else range(reached, len(ends))
-        fit = next((k for k in candidates if not misses[number][k]), None)
-        if fit is None:
-            best = min(
-                (k for k in candidates if k), key=lambda k: max(m.amount for m in misses[number][k])
-            )
-            found += [
-                samples.make_violation("goal", *miss, waypoint=ends[best])
-                for miss in misses[number][best]
-            ]
-        else:
-            reached = fit
-    holds = [[not missing for missing in row] for row in misses]
-    return found or _check_order(samples, steps, hands, holds)
+        is_met = [not errors for errors in misses]
+        holds.append(is_met)
+        begin = len(ends) - 1 if number == last_step else reached
+        if True in is_met[begin:]:
+            reached = is_met.index(True, begin)
+            continue
+        best = _find_nearest_end(misses, max(begin, 1))
+        for miss in misses[best]:
+            found.append(samples.make_violation("goal", *miss, waypoint=ends[best]))
+    return found or _check_order(samples, steps, grasped, holds)
+
+
+def _find_nearest_end(misses: list[list[GoalError]], begin: int) -> int:
+    """Return the first number of phases, from `begin` on, with the smallest largest miss."""
+    largest = [max(miss.amount for miss in errors) for errors in misses[begin:]]
+    return begin + largest.index(min(largest))
 
 
 def find_grasped_objects(samples: Samples, steps: Sequence[Step]) -> list[set[str]]:
     """Return the free objects that must be grasped before the first and after each step."""
     objects = samples.scene.objects
-    held = {
-        hold.object: hold.frame or ""
-        for hold in samples.scene.holds
-        if objects[hold.object].object.free
-    }
-    hands = [set(held)]
+    # The grasped objects, with the frame by which each is grasped; "" is the hand.
+    frames: dict[str, str] = {}
+    for hold in samples.scene.holds:
+        if objects[hold.object].object.free:
+            frames[hold.object] = hold.frame or ""
+    grasped = [set(frames)]
     for step in steps:
-        owner = (
-            step.frame.partition(".")[0]
-            if isinstance(step, Touch)
-            else getattr(step, "object", None)
-        )
-        if (
-            isinstance(step, Grasp | Touch)
-            and owner is not None
-            and owner in objects
-            and objects[owner].object.free
-        ):
-            held.setdefault(owner, (step.by or "") if isinstance(step, Grasp) else "")
+        if isinstance(step, Grasp):
+            owner = step.object
+            frame = step.by or ""
+        elif isinstance(step, Touch):
+            owner = _get_owner(step.frame)
+            frame = ""
+        else:
+            owner = ""
+            frame = ""
+        if owner in objects and objects[owner].object.free:
+            frames.setdefault(owner, frame)
         if isinstance(step, Place | Release):
-            released = set(held) if owner is None else {owner}
-            while (
-                more := {name for name, by in held.items() if by.partition(".")[0] in released}
-                - released
-            ):
-                released |= more
-            held = {name: by for name, by in held.items() if name not in released}
-        hands.append(set(held))
-    return hands
+            released = set(frames) if step.object is None else _find_released(frames, step.object)
+            frames = {name: frame for name, frame in frames.items() if name not in released}
+        grasped.append(set(frames))
+    return grasped
+
+
+def _find_released(frames: dict[str, str], owner: str) -> set[str]:
+    """Return an object and all that are grasped by it, by these, and so on."""
+    released = {owner}
+    while True:
+        more = {name for name, frame in frames.items() if _get_owner(frame) in released}
+        if more <= released:
+            return released
+        released |= more
 
 
 def _find_missing_grasps(
-    samples: Samples, steps: Sequence[Step], hands: list[set[str]], number: int, end: int
+    samples: Samples, steps: Sequence[Step], grasped: list[set[str]], number: int, end: int
 ) -> list[GoalError]:
     """Return the objects that are not grasped after `end` phases although the step needs them."""
     phases = samples.trajectory.phases
-    near = {owner for phase in phases[max(end - 1, 0) : end + 1] for owner in phase.held}
-    near |= set() if end else set(samples.scene.held)
-    wanted = set(hands[number + 1])
+    present = set[str]()
+    for phase in phases[max(end - 1, 0) : end + 1]:
+        present.update(phase.held)
+    if end == 0:
+        present.update(samples.scene.held)
+    wanted = set(grasped[number + 1])
     step = steps[number]
     if isinstance(step, Grasp):
-        after = next(iter(steps[number + 1 :]), None)
+        after = steps[number + 1] if number + 1 < len(steps) else None
         ends_at_once = isinstance(after, Release) and after.object in (None, step.object)
         if end == len(phases) or ends_at_once:
             wanted.discard(step.object)  # no phase with the grasp follows
-    return [GoalError(name, 1.0, "holds", "is not grasped") for name in sorted(wanted - near)]
+    return [GoalError(name, 1.0, "holds", "is not grasped") for name in sorted(wanted - present)]
 
 
 def _check_order(
-    samples: Samples, steps: Sequence[Step], hands: list[set[str]], holds: list[list[bool]]
+    samples: Samples, steps: Sequence[Step], grasped: list[set[str]], holds: list[list[bool]]
 ) -> list[Violation]:
-    """Check the order of object motions; `holds[i][k]`: step i holds when phase k begins."""
+    """Check the order of object motions; `holds[i][k]`: step i holds when phase k begins.
+
+    The motion is read phase by phase. Several steps may be in progress then, since the goals of
+    some may hold already. A step remains if it may move all that moves in the phase.
+    """
     phases = samples.trajectory.phases
-    named = set().union(*hands, *({step.object} for step in steps if isinstance(step, Place)))
-    moved = [
-        _measure_joint_motion(samples, k) | _measure_transport(samples, k, named)
-        for k in range(len(phases))
-    ]
-    own = [
-        hands[i] | hands[i + 1] | ({step.object} if isinstance(step, Actuate | Place) else set())
-        for i, step in enumerate(steps)
-    ]
-    turns = {0}  # steps that may be in progress
-    for k in range(len(phases) + 1):
-        for turn in range(len(steps) - 1):
-            if turn in turns and holds[turn][k]:
-                turns.add(turn + 1)
-        if k == len(phases):
-            break
-        left = {turn for turn in turns if moved[k].keys() <= own[turn]}
-        if not left:
-            last, phase = max(turns), phases[k]
-            name = next(owner for owner in moved[k] if owner not in own[last])
-            amount, unit = moved[k][name]
-            instead = f"when it is the turn of step {last + 1}, {type(steps[last]).__name__}"
+    named = set[str]().union(*grasped)
+    movable: list[set[str]] = []  # the objects that each step may move
+    for number, step in enumerate(steps):
+        owners = grasped[number] | grasped[number + 1]
+        if isinstance(step, Actuate | Place):
+            owners.add(step.object)
+        if isinstance(step, Place):
+            named.add(step.object)
+        movable.append(owners)
+    last_step = len(steps) - 1
+    current = {0}  # steps that may be in progress
+    for k, phase in enumerate(phases):
+        _advance(current, holds, k, last_step)
+        moved = _measure_joint_motion(samples, k)
+        moved.update(_measure_transport(samples, k, named))
+        remaining = {number for number in current if moved.keys() <= movable[number]}
+        if not remaining:
+            latest = max(current)
+            name = next(owner for owner in moved if owner not in movable[latest])
+            amount, unit = moved[name]
+            instead = f"when it is the turn of step {latest + 1}, {type(steps[latest]).__name__}"
             detail = f"moves by {amount:.4f} {unit} in '{phase.name}', {instead}"
             return [
                 samples.make_violation("order", name, amount, unit, detail, waypoint=phase.first)
             ]
-        turns = left
-    if len(steps) - 1 in turns:
+        current = remaining
+    _advance(current, holds, len(phases), last_step)
+    if last_step in current:
         return []
-    first, end = max(turns), phases[-1].last
-    detail = f"{type(steps[first]).__name__} is undone before the next step begins"
+    latest = max(current)
+    detail = f"{type(steps[latest]).__name__} is undone before the next step begins"
     return [
-        samples.make_violation("order", f"step {first + 1}", 1.0, "steps", detail, waypoint=end)
+        samples.make_violation(
+            "order", f"step {latest + 1}", 1.0, "steps", detail, waypoint=phases[-1].last
+        )
     ]
+
+
+def _advance(current: set[int], holds: list[list[bool]], phase: int, last_step: int) -> None:
+    """Add the steps that may begin when a phase begins, since those before them hold."""
+    for number in range(last_step):
+        if number in current and holds[number][phase]:
+            current.add(number + 1)
 
 
 def _measure_transport(
     samples: Samples, number: int, named: set[str]
 ) -> dict[str, tuple[float, str]]:
     """Return the named objects that are grasped in a phase, with their path lengths."""
-    phase, world = samples.trajectory.phases[number], samples.world
-    rows = samples.z[samples.get_rows(phase)]
-    carried = {}
+    phase = samples.trajectory.phases[number]
+    z = samples.z[samples.get_rows(phase)]
+    carried: dict[str, tuple[float, str]] = {}
     for owner in phase.held:
         if owner in named:
-            moves = np.diff(rows[:, world.get_placement_columns(owner)][:, :3], axis=0)
-            carried[owner] = (float(np.linalg.norm(moves, axis=1).sum()), "m")
+            placements = z[:, samples.world.get_placement_columns(owner)]
+            steps = np.diff(placements[:, :3], axis=0)
+            carried[owner] = (float(np.linalg.norm(steps, axis=1).sum()), "m")
     return carried
 
 
@@ -234,10 +265,12 @@ def _measure_joint_motion(samples: Samples, number: int) -> dict[str, tuple[floa
     for column, name in enumerate(samples.trajectory.names):
         if name not in driven:
             continue
-        owner = name.partition(".")[0]
+        owner = _get_owner(name)
         low, high = (side[phase.first : phase.last, column] for side in samples.ranges)
-        if (spread := float(high.max() - low.min())) > MOTION_TOLERANCE:
-            moved[owner] = max(moved.get(owner, (0.0, "")), (spread, samples.get_unit(name)))
+        spread = float(high.max() - low.min())
+        if spread > MOTION_TOLERANCE:
+            known = moved.get(owner, (0.0, ""))
+            moved[owner] = max(known, (spread, samples.get_unit(name)))
     return moved
 
 
@@ -246,16 +279,17 @@ def _compute_goal_errors(
 ) -> list[GoalError]:
     """Return the unmet parts of a step's goal after `end` phases."""
     phases = samples.trajectory.phases
-    row = int(samples.waypoint_rows[phases[end - 1].last if end else 0])
+    waypoint = phases[end - 1].last if end else 0
+    row = int(samples.waypoint_rows[waypoint])
     tolerance = {"m": tolerances.goal_position, "rad": tolerances.goal_angle}
-    misses = list[GoalError]()
+    misses: list[GoalError] = []
     for subject, error, unit, detail in _compute_errors(samples, step, end, row):
         if not error <= tolerance[unit]:
             misses.append(GoalError(subject, error - tolerance[unit], unit, detail))
     if isinstance(step, Place | Release):
         held = phases[min(end, len(phases) - 1)].held  # grasps of the next phase
-        for name in [step.object] if step.object is not None else list(held):
-            if name in held:
+        for name in held:
+            if step.object in (None, name):
                 misses.append(GoalError(name, 1.0, "holds", "is still grasped"))
     return misses
 
@@ -272,10 +306,7 @@ def _compute_errors(samples: Samples, step: Step, end: int, row: int) -> Iterato
     elif isinstance(step, Configure):
         yield from _compute_joint_errors(samples, step, row)
     elif isinstance(step, Grasp):
-        phases = samples.trajectory.phases
-        near = phases[max(end - 1, 0) : end + 1]  # those that end or begin here
-        holds = [hold for phase in near for hold in phase.holds if hold.frame == step.by]
-        attachment, (distance, turn) = _find_closest_grasp(samples, step, row, holds)
+        attachment, distance, turn = _find_closest_grasp(samples, step, end, row)
         name = f"{step.object}.{attachment}"
         yield GoalError(name, distance, "m", f"the tool is {distance:.4f} m from the grasp")
         yield GoalError(name, turn, "rad", f"the tool is turned {turn:.4f} rad from the grasp")
@@ -315,28 +346,28 @@ def _get_target(samples: Samples, step: Reach | Touch | Place) -> tuple[str, pin
     """Return a step's frame, its target and its free orientation: "", "heading" or "all"."""
     if isinstance(step, Reach):
         return step.frame or samples.scene.robot.tool_frame, step.pose, ""
-    goal = step.target if isinstance(step, Touch) else step.pose
-    frame = (
-        step.frame
-        if isinstance(step, Touch)
-        else f"{step.object}.{samples.scene.objects[step.object].object.base_link}"
-    )
-    if isinstance(goal, pin.SE3):
-        return frame, goal, ""
     if isinstance(step, Touch):
-        return frame, pin.SE3(np.eye(3), np.array(goal)), "all"
+        if isinstance(step.target, pin.SE3):
+            return step.frame, step.target, ""
+        return step.frame, pin.SE3(np.eye(3), np.array(step.target)), "all"
     placed = samples.scene.objects[step.object]
-    stands = np.eye(3) if step.object in samples.scene.held else placed.placement.rotation
-    return frame, pin.SE3(stands, np.array(goal)), "heading"
+    frame = f"{step.object}.{placed.object.base_link}"
+    if isinstance(step.pose, pin.SE3):
+        return frame, step.pose, ""
+    upright = np.eye(3) if step.object in samples.scene.held else placed.placement.rotation
+    return frame, pin.SE3(upright, np.array(step.pose)), "heading"
 
 
 def _compute_angle_error(placement: pin.SE3, target: pin.SE3, free: str) -> float:
     """Compute the angle [rad] between two placements, ignoring the free part."""
     if free == "all":
         return 0.0
-    if free == "heading":  # the angle between the two vertical axes in the body frame
-        one, other = placement.rotation[2], target.rotation[2]
-        return float(np.arctan2(np.linalg.norm(np.cross(one, other)), one @ other))
+    if free == "heading":
+        # the world's vertical axis in the frames of both placements
+        vertical = placement.rotation[2]
+        target_vertical = target.rotation[2]
+        sine = np.linalg.norm(np.cross(vertical, target_vertical))
+        return float(np.arctan2(sine, vertical @ target_vertical))
     return float(np.linalg.norm(pin.log3(target.rotation.T @ placement.rotation)))
 
 
@@ -348,26 +379,33 @@ def make_hold(scene: Scene, step: Grasp, attachment: str) -> Hold:
 
 
 def _find_closest_grasp(
-    samples: Samples, step: Grasp, row: int, holds: Iterable[Hold]
-) -> tuple[str, tuple[float, float]]:
+    samples: Samples, step: Grasp, end: int, row: int
+) -> tuple[str, float, float]:
     """Return a grasp step's attachment and the tool's distance [m] and angle [rad] from it.
 
     Without a name, it is the nearest attachment that is used at the start or in a phase. The
-    distance from one of `holds`, those just before and after, is that from the grasp as measured.
+    distance from a hold of the phases that end or begin after `end` phases is that from the grasp
+    as measured.
     """
-    used = [samples.scene.held, *(phase.held for phase in samples.trajectory.phases)]
-    names = (
-        [step.attachment]
-        if step.attachment is not None
-        else [held[step.object] for held in used if step.object in held]
-    )
-    names = names or [samples.scene.objects[step.object].object.attachment().name]
-    known = {hold.attachment: hold for hold in holds if hold.object == step.object}
-    errors = {
-        name: samples.compute_grasp_errors(
-            known.get(name) or make_hold(samples.scene, step, name), np.array([row])
-        )[0]
-        for name in names
-    }
+    phases = samples.trajectory.phases
+    known: dict[str, Hold] = {}
+    for phase in phases[max(end - 1, 0) : end + 1]:
+        for hold in phase.holds:
+            if hold.frame == step.by and hold.object == step.object:
+                known[hold.attachment] = hold
+    errors: dict[str, Floats] = {}
+    for name in _list_candidates(samples, step):
+        hold = known[name] if name in known else make_hold(samples.scene, step, name)
+        errors[name] = samples.compute_grasp_errors(hold, np.array([row]))[0]
     name = min(errors, key=lambda key: float(errors[key].max()))
-    return name, (float(errors[name][0]), float(errors[name][1]))
+    distance, angle = errors[name]
+    return name, float(distance), float(angle)
+
+
+def _list_candidates(samples: Samples, step: Grasp) -> list[str]:
+    """Return the attachments that a grasp step may mean, without repetition."""
+    if step.attachment is not None:
+        return [step.attachment]
+    used = [samples.scene.held, *(phase.held for phase in samples.trajectory.phases)]
+    names = dict.fromkeys(held[step.object] for held in used if step.object in held)
+    return list(names) or [samples.scene.objects[step.object].object.attachment().name]

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,16 +18,25 @@ from vkc_pin.world.trajectory.curve import sample_intervals
 from vkc_pin.world.trajectory.torques import MotionSamples, Torques, sample_curve
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-_MOTION_TOLERANCE = 1e-9  # relative to a limit
-_MIN_SHARE = 5e-3  # smaller shares of the duration are not reported
-ACCEPTED_RATE_TOLERANCE = 1e-3  # relative excess over a limit
-REST_TOLERANCE = 1e-6  # [m/s] or [rad/s]
-JUMP_TOLERANCE = 1e-3  # jump of an acceleration, relative to its limit
+# relative to a limit; slower segments are at rest
+_MOTION_TOLERANCE = 1e-9
+# smaller shares of the duration are not reported
+_MIN_SHARE = 5e-3
+# relative excess over a limit
+ACCEPTED_RATE_TOLERANCE = 1e-3
+# speed at the ends [m/s] or [rad/s]
+REST_TOLERANCE = 1e-6
+# jump of an acceleration, relative to its limit
+JUMP_TOLERANCE = 1e-3
 # Relative excess over a limit. Torques are evaluated only at three times of every cubic.
 TORQUE_TOLERANCE = 5e-3
-STEP_TOLERANCE = 1e-4  # lateral motion, or shortfall for the turn, between waypoints [m]
-SLIP_TOLERANCE = 1e-3  # lateral velocity, or shortfall for the turn, along a curve [m/s]
-WHEEL_TOLERANCE = 1e-3  # relative excess over the limit
+# lateral motion, or shortfall for the turn, between waypoints [m]
+STEP_TOLERANCE = 1e-4
+# lateral velocity, or shortfall for the turn, along a curve [m/s]
+SLIP_TOLERANCE = 1e-3
+# relative excess over the limit
+WHEEL_TOLERANCE = 1e-3
+# times per cubic at which rolling is checked
 _SAMPLES_PER_CUBIC = 16
 
 
@@ -42,36 +51,59 @@ def find_limiting_constraints(
         torques: Torques at these times relative to their limits, shape (K, robot coordinates).
         jerk_time: See `Options.jerk_time`.
     """
-    curve, names = samples.trajectory.curve, samples.trajectory.names
+    curve = samples.trajectory.curve
+    names = samples.trajectory.names
     if curve is None:
         return ()
-    limits = np.array([samples.get_limits(name)[2:] for name in names]).T
-    shares = [rates / limit for rates, limit in zip(curve.compute_max_rates(), limits, strict=True)]
-    shares.append(jerk_time * curve.compute_jerks()[0] / limits[1])
-    shares.append(np.zeros((len(curve.times) - 1, torques.shape[1])))
-    np.maximum.at(shares[-1], moments.pieces, torques)
-    every = np.hstack(shares)
+    limits = np.array([samples.get_limits(name)[2:] for name in names])
+    velocity_limits = limits[:, 0]
+    acceleration_limits = limits[:, 1]
+    # The largest rates of each cubic relative to their limits, one column a limit.
+    speeds, accelerations = curve.compute_max_rates()
+    velocity_ratios = speeds / velocity_limits
+    acceleration_ratios = accelerations / acceleration_limits
+    jerk_ratios = jerk_time * curve.compute_jerks()[0] / acceleration_limits
+    torque_ratios = np.zeros((len(curve.times) - 1, torques.shape[1]))
+    np.maximum.at(torque_ratios, moments.pieces, torques)
+    ratios = np.hstack([velocity_ratios, acceleration_ratios, jerk_ratios, torque_ratios])
     labels = [(name, kind) for kind in ("velocity", "acceleration", "jerk") for name in names]
     labels += [(name, "torque") for name in names[: torques.shape[1]]]
-    moving = (np.hstack(shares[:2]) > _MOTION_TOLERANCE).any(axis=1)
-    nearest = np.where(moving, every.argmax(axis=1), len(labels))
-    spans, found = np.diff(curve.times), list[Bound]()
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(nearest)) + 1, [len(nearest)]])
+    rates = np.hstack([velocity_ratios, acceleration_ratios])
+    is_moving = (rates > _MOTION_TOLERANCE).any(axis=1)
+    at_rest = len(labels)
+    labels.append(("", "rest"))
+    nearest = np.where(is_moving, ratios.argmax(axis=1), at_rest)
+    spans = np.diff(curve.times)
+    found: list[Bound] = []
     for number in np.unique(nearest).tolist():
-        stretches = [
-            (curve.times[a], curve.times[b])
-            for a, b in itertools.pairwise(edges)
-            if nearest[a] == number
-        ]
-        begin, end = max(stretches, key=lambda stretch: float(stretch[1] - stretch[0]))
-        name, kind = (*labels, ("", "rest"))[number]
         share = float(spans[nearest == number].sum() / spans.sum())
-        found.append(Bound(name, kind, share=share, begin=float(begin), end=float(end)))
-    return tuple(
-        sorted(
-            (bound for bound in found if bound.share >= _MIN_SHARE), key=lambda bound: -bound.share
-        )
-    )
+        if share < _MIN_SHARE:
+            continue
+        name, kind = labels[number]
+        begin, end = _find_longest_stretch(curve.times, nearest, number)
+        found.append(Bound(name, kind, share=share, begin=begin, end=end))
+    return tuple(sorted(found, key=lambda bound: -bound.share))
+
+
+def _find_longest_stretch(times: Floats, labels: Ints, label: int) -> tuple[float, float]:
+    """Return begin and end [s] of the longest run of intervals with a label, the first of equals.
+
+    Args:
+        times: Edges of the intervals, shape (K + 1,) [s].
+        labels: Label of each interval, shape (K,).
+        label: The label of the run.
+    """
+    changes = np.flatnonzero(np.diff(labels)) + 1
+    edges = np.concatenate([[0], changes, [len(labels)]])
+    longest = -np.inf
+    stretch = (0.0, 0.0)
+    for first, last in itertools.pairwise(edges):
+        begin = float(times[first])
+        end = float(times[last])
+        if labels[first] == label and end - begin > longest:
+            longest = end - begin
+            stretch = (begin, end)
+    return stretch
 
 
 def check_rates(samples: Samples, options: Options) -> Iterator[Violation]:
@@ -81,68 +113,103 @@ def check_rates(samples: Samples, options: Options) -> Iterator[Violation]:
     they are largest. The jerk of each cubic is constant; with jerk limits, accelerations must not
     jump between cubics. Jerks of a motion without a curve are not checked, as its velocities jump.
     """
-    motion, curve = samples.trajectory, samples.trajectory.curve
+    motion = samples.trajectory
+    curve = motion.curve
+    ends = motion.times[[0, -1]]
     jerks: tuple[Floats, Floats] | None = None
     if curve is None:
-        moments, rests = motion.times, np.zeros((2, len(motion.names)))
-        velocities, accelerations = motion.velocities(), motion.accelerations()
+        moments = motion.times
+        end_speeds = np.zeros((2, len(motion.names)))
+        velocities = motion.velocities()
+        accelerations = motion.accelerations()
     else:
-        moments, rests = curve.times, np.abs(curve.rates[[0, -1]])
+        moments = curve.times
+        end_speeds = np.abs(curve.rates[[0, -1]])
         velocities, accelerations = curve.compute_max_rates()
-        jerks = curve.compute_jerks() if options.jerk_time > 0.0 else None
+        if options.jerk_time > 0.0:
+            jerks = curve.compute_jerks()
     for i, name in enumerate(motion.names):
-        _, _, fastest, strongest = samples.get_limits(name)
-        looks = [
-            ("velocity", velocities[:, i], fastest, "s", moments),
-            ("acceleration", accelerations[:, i], strongest, "s²", moments),
-            ("velocity", rests[:, i], REST_TOLERANCE, "s", motion.times[[0, -1]]),
+        _, _, max_speed, max_acceleration = samples.get_limits(name)
+        checks = [
+            _RateCheck("velocity", velocities[:, i], max_speed, "s", moments),
+            _RateCheck("acceleration", accelerations[:, i], max_acceleration, "s²", moments),
+            _RateCheck("velocity", end_speeds[:, i], REST_TOLERANCE, "s", ends),
         ]
-        if jerks is not None and np.isfinite(strongest):
-            looks.append(("jerk", jerks[0][:, i], strongest / options.jerk_time, "s³", moments))
-            looks.append(
-                ("jerk", jerks[1][:, i], JUMP_TOLERANCE * strongest, "s² at once", moments)
-            )
-        unit = samples.get_unit(name)
-        for kind, values, limit, per, when in looks:
-            worst = int(np.argmax(np.abs(values)))
-            value = abs(float(values[worst]))
-            if not value <= limit * (1 + ACCEPTED_RATE_TOLERANCE) + 1e-9:
-                at = max(int(np.searchsorted(motion.times, when[worst], side="right")) - 1, 0)
-                detail = f"{value:.3f} {unit}/{per} is more than {limit:.3f} {unit}/{per}"
-                yield samples.make_violation(
-                    kind, name, value - limit, f"{unit}/{per}", detail, waypoint=at
-                )
+        if jerks is not None and np.isfinite(max_acceleration):
+            inside, jumps = jerks
+            max_jerk = max_acceleration / options.jerk_time
+            max_jump = JUMP_TOLERANCE * max_acceleration
+            checks.append(_RateCheck("jerk", inside[:, i], max_jerk, "s³", moments))
+            checks.append(_RateCheck("jerk", jumps[:, i], max_jump, "s² at once", moments))
+        for check in checks:
+            yield from _check_rate(samples, name, check)
+
+
+class _RateCheck(NamedTuple):
+    """Values of one coordinate, and the limit of their magnitudes.
+
+    Attributes:
+        kind: Name of the constraint.
+        values: The values, shape (K,).
+        limit: Limit of their magnitudes.
+        per: What follows "m/" or "rad/" in their unit.
+        times: Times of the values [s], shape (K,) or more.
+    """
+
+    kind: str
+    values: Floats
+    limit: float
+    per: str
+    times: Floats
+
+
+def _check_rate(samples: Samples, name: str, check: _RateCheck) -> Iterator[Violation]:
+    """Yield the worst violation of one limit of a coordinate."""
+    limit = check.limit
+    worst = int(np.argmax(np.abs(check.values)))
+    value = abs(float(check.values[worst]))
+    if value <= limit * (1 + ACCEPTED_RATE_TOLERANCE) + 1e-9:
+        return
+    before = int(np.searchsorted(samples.trajectory.times, check.times[worst], side="right")) - 1
+    unit = f"{samples.get_unit(name)}/{check.per}"
+    detail = f"{value:.3f} {unit} is more than {limit:.3f} {unit}"
+    yield samples.make_violation(
+        check.kind, name, value - limit, unit, detail, waypoint=max(before, 0)
+    )
 
 
 class MotorLoads:
     """Motor torques at the ends and middle of every cubic, or at waypoints if there is no curve."""
 
     def __init__(self, samples: Samples) -> None:
-        self.samples, self.trajectory = samples, samples.trajectory
+        self.samples = samples
+        self.trajectory = samples.trajectory
         self._torques = Torques(samples.scene, samples.trajectory, samples.free_objects)
 
     @cached_property
     def moments(self) -> MotionSamples:
         """Times of the evaluation and the motion at these times."""
-        trajectory, curve = self.trajectory, self.trajectory.curve
-        if curve is not None:
-            return sample_curve(curve)
+        trajectory = self.trajectory
+        if trajectory.curve is not None:
+            return sample_curve(trajectory.curve)
+        count = len(trajectory.times)
+        segments = np.minimum(np.arange(count), count - 2)
+        # The velocity at a waypoint is the mean of those before and after it, at rest outside.
         speeds = np.pad(trajectory.velocities(), ((1, 1), (0, 0)))
-        pieces = np.minimum(np.arange(len(trajectory.times)), len(trajectory.times) - 2)
+        velocities = 0.5 * (speeds[1:] + speeds[:-1])
         return MotionSamples(
             trajectory.times,
-            pieces,
+            segments,
             trajectory.positions,
-            0.5 * (speeds[1:] + speeds[:-1]),
+            velocities,
             trajectory.accelerations(),
         )
 
     @cached_property
     def waypoints(self) -> Ints:
         """Last waypoint at or before each time."""
-        edges = (
-            self.trajectory.times if self.trajectory.curve is None else self.trajectory.curve.times
-        )
+        curve = self.trajectory.curve
+        edges = self.trajectory.times if curve is None else curve.times
         before = np.searchsorted(self.trajectory.times, edges[:-1], side="right") - 1
         return np.asarray(before[self.moments.pieces])
 
@@ -159,45 +226,51 @@ class MotorLoads:
         return np.asarray(np.abs(self.torques) / self._torques.torque_limits.limits)
 
     def _compute_torques(self, rows: Ints, speed: float = 1.0) -> Floats:
-        now, phases = self.moments, self._torques.phases_of(self.waypoints[rows])
+        """Compute the torques at some times of a motion that is `speed` times as fast."""
+        moments = self.moments
         return self._torques.at(
-            phases,
-            now.positions[rows],
-            speed * now.velocities[rows],
-            speed**2 * now.accelerations[rows],
+            self._torques.phases_of(self.waypoints[rows]),
+            moments.positions[rows],
+            speed * moments.velocities[rows],
+            speed**2 * moments.accelerations[rows],
         )
 
     def find_violations(self) -> list[Violation]:
         """Return the worst violation of each joint's torque limit."""
-        found = list[Violation]()
-        for k in np.flatnonzero(self.torque_ratios.max(axis=0) > 1.0 + TORQUE_TOLERANCE).tolist():
-            row = int(np.argmax(self.torque_ratios[:, k]))
-            name, limit = self.trajectory.names[k], float(self._torques.torque_limits.limits[k])
-            torque = abs(self.torques[row, k])
-            unit = "N" if self.samples.get_unit(name) == "m" else "N·m"
-            rest = abs(float(self._compute_torques(np.array([row]), 1e-2)[0, k]))
-            why = f"{rest:.4g} {unit} {'even ' if rest > limit else ''}at rest"
-            detail = f"{torque:.4g} {unit} exceeds the motor's {limit:.4g} {unit}, {why}"
-            at, time = int(self.waypoints[row]), float(self.moments.times[row])
-            found.append(
-                self.samples.make_violation(
-                    "torque", name, torque - limit, unit, detail, waypoint=at, time=time
-                )
-            )
-        return found
+        exceeded = self.torque_ratios.max(axis=0) > 1.0 + TORQUE_TOLERANCE
+        return [self._make_violation(k) for k in np.flatnonzero(exceeded).tolist()]
+
+    def _make_violation(self, k: int) -> Violation:
+        """Make the worst violation of the torque limit of coordinate k."""
+        row = int(np.argmax(self.torque_ratios[:, k]))
+        name = self.trajectory.names[k]
+        limit = float(self._torques.torque_limits.limits[k])
+        torque = abs(self.torques[row, k])
+        unit = "N" if self.samples.get_unit(name) == "m" else "N·m"
+        # At a hundredth of the speed little but the weight is left.
+        torque_at_rest = abs(float(self._compute_torques(np.array([row]), 1e-2)[0, k]))
+        even = "even " if torque_at_rest > limit else ""
+        why = f"{torque_at_rest:.4g} {unit} {even}at rest"
+        return self.samples.make_violation(
+            "torque",
+            name,
+            torque - limit,
+            unit,
+            f"{torque:.4g} {unit} exceeds the motor's {limit:.4g} {unit}, {why}",
+            waypoint=int(self.waypoints[row]),
+            time=float(self.moments.times[row]),
+        )
 
     def summarize(self, jerk_time: float = 0.0) -> dict[str, Any]:
         """Return the fields of the report; `jerk_time` is that of `Options`."""
         remarks = [f"torques not checked: {note}" for note in self._torques.torque_limits.notes]
         if self._torques.massless_objects:
-            remarks.append(
-                "carried as massless, since no mass is given: "
-                f"{', '.join(self._torques.massless_objects)}"
-            )
-        found = find_limiting_constraints(self.samples, self.moments, self.torque_ratios, jerk_time)
+            names = ", ".join(self._torques.massless_objects)
+            remarks.append(f"carried as massless, since no mass is given: {names}")
+        ratios = self.torque_ratios
         return {
-            "torque": float(self.torque_ratios.max(initial=0.0)),
-            "bounds": found,
+            "torque": float(ratios.max(initial=0.0)),
+            "bounds": find_limiting_constraints(self.samples, self.moments, ratios, jerk_time),
             "remarks": tuple(remarks),
         }
 
@@ -209,67 +282,125 @@ def check_rolling(samples: Samples) -> Iterator[Violation]:
     waypoints is undefined; the base is assumed to follow the arc between them, whose chord is
     parallel to the mean heading.
     """
-    robot, motion = samples.scene.robot, samples.trajectory
+    robot = samples.scene.robot
     if robot.base not in ("differential", "ackermann"):
         return
-    smooth = motion.curve is not None
-    unit, per = ("m/s", "") if smooth else ("m", " in a step")
-    usual = SLIP_TOLERANCE if smooth else STEP_TOLERANCE
-    moments, along, aside, turn = _sample_velocities(motion) if smooth else _compute_steps(motion)
-    spans = np.ones(len(moments)) if smooth else np.diff(motion.times)
-    for kind, excess, tolerance, text in _compute_excesses(robot, along, aside, turn, spans):
-        worst = int(np.argmax(excess))
-        amount, time = float(excess[worst]), float(moments[worst])
-        if not amount <= (usual if tolerance is None else tolerance):
-            in_text = f"{1e3 * amount:.2f} m{unit}{per}"
-            if tolerance is not None:
-                unit, in_text = "m/s", f"{amount:.3f} m/s"
-            detail = f"the base {text.format(in_text)}"
-            yield samples.make_violation(kind, "base", amount, unit, detail, time=time)
+    rolling = _measure_rolling(samples.trajectory)
+    for check in _compute_excesses(robot, rolling):
+        worst = int(np.argmax(check.excess))
+        amount = float(check.excess[worst])
+        if not amount <= check.tolerance:
+            detail = f"the base {check.text.format(check.format_amount(amount))}"
+            yield samples.make_violation(
+                check.kind, "base", amount, check.unit, detail, time=float(rolling.times[worst])
+            )
 
 
-def _compute_excesses(
-    robot: Robot, along: Floats, aside: Floats, turn: Floats, spans: Floats
-) -> Iterator[tuple[str, Floats, float | None, str]]:
-    """Yield constraint, excess, tolerance (None: the default) and text for each constraint.
+class _Rolling(NamedTuple):
+    """Motion of the base in its own frame: velocities on a curve, or displacements of segments.
 
-    `along`, `aside` and `turn` are displacements in times `spans`, or velocities, whose `spans` are
-    1; all of shape (K,).
+    Attributes:
+        times: Times on the curve, or begins of the segments, shape (K,) [s].
+        along: Longitudinal motion, shape (K,) [m/s] or [m].
+        aside: Lateral motion, shape (K,) [m/s] or [m].
+        turn: Change of the heading, shape (K,) [rad/s] or [rad].
+        spans: Durations of the displacements, shape (K,) [s]; 1 for velocities.
+        is_velocity: Whether these are velocities.
     """
-    yield "slip", np.abs(aside), None, "slips sideways by {}"
+
+    times: Floats
+    along: Floats
+    aside: Floats
+    turn: Floats
+    spans: Floats
+    is_velocity: bool
+
+
+class _RollingCheck(NamedTuple):
+    """How far one constraint of rolling is exceeded, with the text of a violation.
+
+    Attributes:
+        kind: Name of the constraint.
+        excess: Excess over the limit, shape (K,).
+        tolerance: Accepted excess.
+        unit: Unit of both.
+        text: Text, in which "{}" stands for the excess.
+        format_amount: Makes the text of an excess.
+    """
+
+    kind: str
+    excess: Floats
+    tolerance: float
+    unit: str
+    text: str
+    format_amount: Callable[[float], str]
+
+
+def _compute_excesses(robot: Robot, rolling: _Rolling) -> Iterator[_RollingCheck]:
+    """Yield the excess of each constraint of a wheeled base.
+
+    A base rolls without slip if its lateral motion is 0. With a turning radius r it moves at least
+    r |turn| along. Its outer wheel moves by |along| + track / 2 · |turn|.
+    """
+    if rolling.is_velocity:
+        unit = "m/s"
+        tolerance = SLIP_TOLERANCE
+        format_amount = _format_velocity
+    else:
+        unit = "m"
+        tolerance = STEP_TOLERANCE
+        format_amount = _format_step
+    slip = np.abs(rolling.aside)
+    yield _RollingCheck("slip", slip, tolerance, unit, "slips sideways by {}", format_amount)
     if robot.base == "ackermann":
-        short = robot.turning_radius * np.abs(turn) - np.abs(along)
-        radius = f"a radius of {robot.turning_radius:g} m"
-        yield "turning", short, None, f"drives {{}} less than its turn requires at {radius}"
+        shortfall = robot.turning_radius * np.abs(rolling.turn) - np.abs(rolling.along)
+        text = f"drives {{}} less than its turn requires at a radius of {robot.turning_radius:g} m"
+        yield _RollingCheck("turning", shortfall, tolerance, unit, text, format_amount)
     if robot.wheels is not None:
-        rim = robot.wheels.rim_speed
-        fast = (np.abs(along) + robot.wheels.track / 2 * np.abs(turn)) / spans - rim
-        yield "wheels", fast, WHEEL_TOLERANCE * rim, f"has a wheel that is {{}} over {rim:.3f} m/s"
+        rim_speed = robot.wheels.rim_speed
+        outer = np.abs(rolling.along) + robot.wheels.track / 2 * np.abs(rolling.turn)
+        excess = outer / rolling.spans - rim_speed
+        text = f"has a wheel that is {{}} over {rim_speed:.3f} m/s"
+        yield _RollingCheck(
+            "wheels", excess, WHEEL_TOLERANCE * rim_speed, "m/s", text, _format_wheel_speed
+        )
 
 
-def _compute_steps(motion: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return begin [s], longitudinal and lateral motion [m] and turn [rad] of every segment."""
-    poses = motion.positions[:, :3]
-    return motion.times[:-1], *_transform_to_base_frame(
-        np.diff(poses, axis=0), (poses[1:, 2] + poses[:-1, 2]) / 2
-    )
+def _format_velocity(amount: float) -> str:
+    return f"{1e3 * amount:.2f} mm/s"
 
 
-def _sample_velocities(motion: Trajectory) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return times on a curve and longitudinal, lateral [m/s] and angular velocity [rad/s]."""
-    assert motion.curve is not None
-    shares = np.arange(_SAMPLES_PER_CUBIC) / _SAMPLES_PER_CUBIC
-    moments = sample_intervals(motion.curve.times, shares, last=True)
-    return moments, *_transform_to_base_frame(
-        motion.curve.velocity(moments)[:, :3], motion.curve.at(moments)[:, 2]
-    )
+def _format_step(amount: float) -> str:
+    return f"{1e3 * amount:.2f} mm in a step"
+
+
+def _format_wheel_speed(amount: float) -> str:
+    return f"{amount:.3f} m/s"
+
+
+def _measure_rolling(motion: Trajectory) -> _Rolling:
+    """Return the velocities of the base on a motion's curve, or its segments without a curve."""
+    curve = motion.curve
+    if curve is None:
+        times = motion.times[:-1]
+        poses = motion.positions[:, :3]
+        mean_headings = (poses[1:, 2] + poses[:-1, 2]) / 2
+        along, aside, turn = _transform_to_base_frame(np.diff(poses, axis=0), mean_headings)
+        return _Rolling(times, along, aside, turn, np.diff(motion.times), is_velocity=False)
+    fractions = np.arange(_SAMPLES_PER_CUBIC) / _SAMPLES_PER_CUBIC
+    times = sample_intervals(curve.times, fractions, last=True)
+    velocities = curve.velocity(times)[:, :3]
+    headings = curve.at(times)[:, 2]
+    along, aside, turn = _transform_to_base_frame(velocities, headings)
+    return _Rolling(times, along, aside, turn, np.ones(len(times)), is_velocity=True)
 
 
 def _transform_to_base_frame(change: Floats, heading: Floats) -> tuple[Floats, Floats, Floats]:
-    """Transform changes of (x, y, yaw), shape (K, 3), to the base frame: along, aside, turn."""
+    """Transform changes of (x, y, yaw), shape (K, 3), to the base frame: along, aside, turn.
+
+    With the heading θ, along = cos θ dx + sin θ dy and aside = cos θ dy − sin θ dx.
+    """
     dx, dy, turn = change.T
-    return (
-        np.cos(heading) * dx + np.sin(heading) * dy,
-        np.cos(heading) * dy - np.sin(heading) * dx,
-        turn,
-    )
+    along = np.cos(heading) * dx + np.sin(heading) * dy
+    aside = np.cos(heading) * dy - np.sin(heading) * dx
+    return along, aside, turn

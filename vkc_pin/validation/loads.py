@@ -18,7 +18,8 @@ from vkc_pin.world.scene.footing import Footing, find_footing
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 from vkc_pin.world.task.steps import Place, Release, Step
 
-_MAX_FALL = 10.0  # [m] at which a fall counts that nothing ends
+# [m] at which a fall counts that nothing ends
+_MAX_FALL = 10.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +41,8 @@ def check_loads(
         options: `payload_factor` is checked.
         tolerances: Accepted errors of goals, which may leave an object that much higher.
     """
-    violations, allowed = list[Violation](), list[str]()
+    violations: list[Violation] = []
+    allowed: list[str] = []
     permissions = _find_permissions(samples, steps)
     for number, owner in _list_releases(samples):
         may_fall = bool(permissions.get(owner)) and permissions[owner].pop(0)
@@ -56,10 +58,13 @@ def check_loads(
         violations.append(
             samples.make_violation("support", owner, amount, "m", text, waypoint=begin)
         )
-    heavy = list(_find_overloads(samples, options))
-    violations += [one for one in heavy if isinstance(one, Violation)]
-    allowed += dict.fromkeys(one for one in heavy if isinstance(one, str))
-    return LoadCheck(tuple(violations), tuple(allowed))
+    allowed_overloads: list[str] = []
+    for overload in _find_overloads(samples, options):
+        if isinstance(overload, Violation):
+            violations.append(overload)
+        elif overload not in allowed_overloads:
+            allowed_overloads.append(overload)
+    return LoadCheck(tuple(violations), (*allowed, *allowed_overloads))
 
 
 def _list_releases(samples: Samples) -> Iterator[tuple[int, str]]:
@@ -74,18 +79,20 @@ def _list_releases(samples: Samples) -> Iterator[tuple[int, str]]:
 
 def _find_permissions(samples: Samples, steps: Sequence[Step]) -> dict[str, list[bool]]:
     """Return for each object whether it may fall at its first release, at its second, and so on."""
-    hands = find_grasped_objects(samples, steps)
-    found = dict[str, list[bool]]()
-    for step, before, after in zip(steps, hands[:-1], hands[1:], strict=True):
-        placed = {step.object} if isinstance(step, Place) else set()
-        for owner in (before | placed) - after:
+    grasped = find_grasped_objects(samples, steps)
+    permissions: dict[str, list[bool]] = {}
+    for step, before, after in zip(steps, grasped[:-1], grasped[1:], strict=True):
+        in_hand = set(before)
+        if isinstance(step, Place):
+            in_hand.add(step.object)
+        for owner in in_hand - after:
             may_fall = isinstance(step, Place | Release) and step.unsupported
-            found.setdefault(owner, []).append(may_fall)
+            permissions.setdefault(owner, []).append(may_fall)
     # Steps need not say how an object came into the hand.
     releases = [step.unsupported for step in steps if isinstance(step, Release)]
-    for owner in samples.scene.objects.keys() - found.keys():
-        found[owner] = list(releases)
-    return found
+    for owner in samples.scene.objects.keys() - permissions.keys():
+        permissions[owner] = list(releases)
+    return permissions
 
 
 def _find_footing(
@@ -98,21 +105,18 @@ def _find_footing(
     if _is_put_back(samples, number, owner, placed, tolerances):
         return None
     supports = samples.free_objects.supports[number - 1] if number else {}
-    load = [
-        _place(samples, name, row)
-        for name, label in supports.items()
-        if label.partition(".")[0] == owner
-    ]
-    apart = {owner, *phase.held, *(one.name for one in load)}
-    others = [
-        (f"{name}.{get_link_name(shape.name)}", shape)
-        for name in samples.scene.objects
-        if name not in apart
-        for shape in make_world_shapes(_place(samples, name, row))
-    ]
+    load_names = [name for name, label in supports.items() if label.partition(".")[0] == owner]
+    load = [_place(samples, name, row) for name in load_names]
+    others: list[tuple[str, pin.GeometryObject]] = []
+    for name in samples.scene.objects:
+        if name == owner or name in phase.held or name in load_names:
+            continue
+        for shape in make_world_shapes(_place(samples, name, row)):
+            others.append((f"{name}.{get_link_name(shape.name)}", shape))
     scene = samples.scene
     others += zip(scene.obstacle_labels, scene.obstacles, strict=True)
     footing = find_footing(placed, others, load)
+    # An object may be released by the tolerance of its goal too high.
     shift = pin.SE3(np.eye(3), np.array([0.0, 0.0, -tolerances.goal_position]))
     lower = dataclasses.replace(placed, placement=shift * placed.placement)
     most = 2.0 * tolerances.goal_position
@@ -123,7 +127,8 @@ def _find_footing(
 
 def _place(samples: Samples, name: str, row: int) -> PlacedObject:
     """Return an object as it is at a sample."""
-    placed, coordinates = samples.scene.objects[name], samples.world.coordinates
+    placed = samples.scene.objects[name]
+    coordinates = samples.world.coordinates
     joints = placed.object.coordinates.names
     values = [samples.z[row, coordinates.index(f"{name}.{joint}")] for joint in joints]
     (pose,) = samples.compute_placements([row], f"{name}.{placed.object.base_link}")
@@ -146,11 +151,14 @@ def _is_put_back(
     if first > 0 or not is_held_from_start:
         known.append(_place(samples, owner, int(samples.waypoint_rows[phases[first].first])))
     for before in known:
-        one, other = placed.placement, before.placement
-        shift = float(np.linalg.norm(one.translation - other.translation))
-        verticals = one.rotation[2], other.rotation[2]
-        sine = float(np.linalg.norm(np.cross(*verticals)))
-        tilt = float(np.arctan2(sine, verticals[0] @ verticals[1]))
+        now = placed.placement
+        then = before.placement
+        shift = float(np.linalg.norm(now.translation - then.translation))
+        # the world's vertical axis in the frames of the object
+        vertical = now.rotation[2]
+        vertical_then = then.rotation[2]
+        sine = float(np.linalg.norm(np.cross(vertical, vertical_then)))
+        tilt = float(np.arctan2(sine, vertical @ vertical_then))
         if shift <= tolerances.goal_position and tilt <= tolerances.goal_angle:
             return True
     return False
@@ -158,7 +166,8 @@ def _is_put_back(
 
 def _find_overloads(samples: Samples, options: Options) -> Iterator[Violation | str]:
     """Yield every phase in which the hand carries more than the payload, as a text if allowed."""
-    payload, objects = samples.scene.robot.payload, samples.scene.objects
+    payload = samples.scene.robot.payload
+    objects = samples.scene.objects
     if payload is None:
         return
     phases = zip(samples.trajectory.phases, samples.free_objects.supports, strict=True)
@@ -169,14 +178,13 @@ def _find_overloads(samples: Samples, options: Options) -> Iterator[Violation | 
         mass = sum(objects[name].object.mass for name in carried)
         if mass <= payload:
             continue
-        what = " and ".join(f"'{name}'" for name in carried)
         text = f"{mass:.3g} kg, more than the robot's payload of {payload:.3g} kg"
         excess = mass - payload * options.payload_factor
-        if excess <= 0.0:
-            yield (
-                f"{what} together are carried: {text}" if resting else f"{what} is carried: {text}"
-            )
-        else:
+        if excess > 0.0:
             yield samples.make_violation(
                 "payload", held[0], excess, "kg", f"carries {text}", waypoint=phase.first
             )
+            continue
+        names = " and ".join(f"'{name}'" for name in carried)
+        verb = "together are" if resting else "is"
+        yield f"{names} {verb} carried: {text}"

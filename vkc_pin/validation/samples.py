@@ -22,11 +22,17 @@ from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
-LENGTH_STEP, ANGLE_STEP = 5e-3, 1e-2  # largest step between two samples [m], [rad]
-CHORD_DEVIATION = 0.1  # largest deviation of a curve from its chord, as a fraction of the step
+# largest step between two samples [m], [rad]
+LENGTH_STEP = 5e-3
+ANGLE_STEP = 1e-2
+# largest deviation of a curve from its chord, as a fraction of the step
+CHORD_DEVIATION = 0.1
 MAX_SAMPLES = 100_000
 """Most samples of a motion: half a kilometre of the base, or 160 turns of a joint."""
-_MAX_COORDINATE = 1e12  # [m] or [rad]
+# [m] or [rad]
+_MAX_COORDINATE = 1e12
+# A count of steps that exceeds an integer by rounding is that integer.
+_COUNT_ROUNDING = 1e-9
 
 
 class Samples:
@@ -52,76 +58,95 @@ class Samples:
     """
 
     def __init__(self, scene: Scene, trajectory: Trajectory) -> None:
-        self.scene, self.trajectory = scene, trajectory
+        self.scene = scene
+        self.trajectory = trajectory
         self.world = World(scene)
-        self.grasp_freedoms: dict[str, Freedom] = {
-            f"{owner}.{name}": freedom
-            for owner, placed in scene.objects.items()
-            for attachment in placed.object.attachments.values()
-            for name, freedom in zip(attachment.coordinates, attachment.freedoms, strict=True)
-        }
+        self.grasp_freedoms: dict[str, Freedom] = {}
+        for owner, placed in scene.objects.items():
+            for attachment in placed.object.attachments.values():
+                names = [f"{owner}.{name}" for name in attachment.coordinates]
+                self.grasp_freedoms.update(zip(names, attachment.freedoms, strict=True))
         self._check_names()
         self._check_phases()
-        far = np.argwhere(np.abs(trajectory.positions) > _MAX_COORDINATE)
-        if len(far):
-            field, expected = f"trajectory.positions{far[0].tolist()}", f"up to {_MAX_COORDINATE:g}"
-            got = trajectory.positions[tuple(far[0])]
-            raise InputError("out of range", field=field, expected=expected, got=got)
+        self._check_positions()
         self.times, self.waypoint_rows = self._choose_times()
         self.free_objects = FreeObjects(scene, trajectory)
         self.z = self.world.compute_positions(trajectory, self.times, self.free_objects)
 
     def _check_names(self) -> None:
-        names, robot = self.trajectory.names, self.scene.robot.coordinates.names
-        if names[: len(robot)] != robot or self.trajectory.robot_size != len(robot):
+        robot_names = self.scene.robot.coordinates.names
+        size = len(robot_names)
+        first_names = self.trajectory.names[:size]
+        if first_names != robot_names or self.trajectory.robot_size != size:
             raise InputError(
                 "not this robot's coordinates",
                 field="trajectory.names",
-                expected=robot,
-                got=names[: len(robot)],
+                expected=robot_names,
+                got=first_names,
             )
         known = [*self.world.coordinates.names, *self.grasp_freedoms]
-        for name in names:
+        for name in self.trajectory.names:
             check_choice(name, known, "coordinate", "trajectory.names")
 
     def _check_phases(self) -> None:
         measured = {hold for hold in self.scene.holds if hold.deviation}
         for number, phase in enumerate(self.trajectory.phases):
+            where = f"trajectory.phases[{number}]"
             measured &= set(phase.holds)
             if phase.opening is not None:
-                self._check_opening(phase.opening, f"trajectory.phases[{number}].opening")
+                self._check_opening(phase.opening, f"{where}.opening")
             for hold in phase.holds:
-                owner, attachment = hold.object, hold.attachment
-                field = f"trajectory.phases[{number}].held"
                 if hold.deviation and hold not in measured:
                     raise InputError(
                         "only grasps of the scene's start deviate, until they end",
-                        field=field.replace("held", "deviation"),
+                        field=f"{where}.deviation",
                         got=str(hold),
                     )
-                check_choice(owner, self.scene.objects, "object", field)
-                attachments = self.scene.objects[owner].object.attachments
-                check_choice(attachment, attachments, f"attachment of '{owner}'", field)
-                if hold.frame is not None:
-                    self.check_frame(hold.frame, field.replace("held", "by"))
-                for name in attachments[attachment].coordinates:
-                    if f"{owner}.{name}" not in self.trajectory.names:
-                        problem = "this grasp's coordinate is missing"
-                        raise InputError(
-                            problem, field="trajectory.names", expected=f"{owner}.{name}"
-                        )
+                self._check_hold(hold, where)
+
+    def _check_hold(self, hold: Hold, where: str) -> None:
+        """Check that what a phase's hold names exists; `where` is the phase."""
+        owner = hold.object
+        check_choice(owner, self.scene.objects, "object", f"{where}.held")
+        attachments = self.scene.objects[owner].object.attachments
+        check_choice(hold.attachment, attachments, f"attachment of '{owner}'", f"{where}.held")
+        if hold.frame is not None:
+            self.check_frame(hold.frame, f"{where}.by")
+        for name in attachments[hold.attachment].coordinates:
+            coordinate = f"{owner}.{name}"
+            if coordinate not in self.trajectory.names:
+                raise InputError(
+                    "this grasp's coordinate is missing",
+                    field="trajectory.names",
+                    expected=coordinate,
+                )
+
+    def _check_positions(self) -> None:
+        positions = self.trajectory.positions
+        far = np.argwhere(np.abs(positions) > _MAX_COORDINATE)
+        if len(far):
+            raise InputError(
+                "out of range",
+                field=f"trajectory.positions{far[0].tolist()}",
+                expected=f"up to {_MAX_COORDINATE:g}",
+                got=positions[tuple(far[0])],
+            )
 
     def _check_opening(self, opening: float, field: str) -> None:
         gripper = self.scene.robot.gripper
         if gripper is None:
-            expected = "a `gripper` in its robot.yaml"
             raise InputError(
-                "the robot's gripper does not open", field=field, expected=expected, got=opening
+                "the robot's gripper does not open",
+                field=field,
+                expected="a `gripper` in its robot.yaml",
+                got=opening,
             )
         if abs(gripper.clamp_opening(opening) - opening) > WIDTH_TOLERANCE:
-            expected = f"{gripper.min_opening:.4g} to {gripper.max_opening:.4g} m"
             raise InputError(
-                "the gripper cannot be so far open", field=field, expected=expected, got=opening
+                "the gripper cannot be so far open",
+                field=field,
+                expected=f"{gripper.min_opening:.4g} to {gripper.max_opening:.4g} m",
+                got=opening,
             )
 
     def check_frame(self, frame: str, field: str) -> None:
@@ -152,15 +177,18 @@ class Samples:
     ) -> Violation:
         """Make a violation at a waypoint, at sample `row`, or at a time [s] after its waypoint."""
         if row is not None:
-            waypoint, time = self.find_waypoint(row), self.times[row]
+            waypoint = self.find_waypoint(row)
+            time = self.times[row]
         if waypoint is None:
             assert time is not None
             waypoint = int(np.searchsorted(self.trajectory.times, time, side="right")) - 1
+        if time is None:
+            time = self.trajectory.times[waypoint]
         return Violation(
             constraint,
             subject,
             waypoint=waypoint,
-            time=float(self.trajectory.times[waypoint] if time is None else time),
+            time=float(time),
             amount=float(amount),
             unit=unit,
             detail=detail,
@@ -173,31 +201,49 @@ class Samples:
 
     def _choose_times(self) -> tuple[Floats, Ints]:
         """Return the sample times [s] and the rows of the waypoints."""
-        curve, edges = self.trajectory.curve, self.trajectory.times
+        curve = self.trajectory.curve
+        edges = self.trajectory.times if curve is None else curve.times
+        required = self._count_samples()
+        self.required_count = float(required.sum())
+        self.is_truncated = self.required_count > max(MAX_SAMPLES, len(required))
+        counts = np.ones(len(required), int) if self.is_truncated else required.astype(int)
+        rows = np.concatenate([[0], np.cumsum(counts)])  # those of the edges
+        numbers = np.arange(rows[-1]) - np.repeat(rows[:-1], counts)  # since the edge before
+        steps = np.repeat(np.diff(edges) / counts, counts)
+        inner = np.repeat(edges[:-1], counts) + numbers * steps
+        times = np.append(inner, edges[-1])
+        return times, rows[np.searchsorted(edges, self.trajectory.times)]
+
+    def _count_samples(self) -> Floats:
+        """Count the samples that each segment, or cubic of the curve, requires, shape (K,).
+
+        In a time h a coordinate with |q̇| ≤ v travels at most h v. If |q̈| ≤ a, it deviates from its
+        chord by at most a h² / 8. In each of n equal parts the deviation is 1 / n² of that.
+        """
+        curve = self.trajectory.curve
         if curve is None:
-            steps = np.abs(np.diff(self.trajectory.positions, axis=0))
-            bends = np.zeros_like(steps)
-        else:  # bounds of the travel and of the chord deviation from the largest rates per cubic
-            edges, spans = curve.times, np.diff(curve.times)[:, None]
+            travel = np.abs(np.diff(self.trajectory.positions, axis=0))
+            deviation = np.zeros_like(travel)
+        else:
+            spans = np.diff(curve.times)[:, None]
             speeds, accelerations = curve.compute_max_rates()
-            steps, bends = speeds * spans, accelerations * spans**2 / 8.0
-        coordinates, default = self.world.coordinates, {"m": LENGTH_STEP, "rad": ANGLE_STEP}
-        largest = coordinates.compute_max_steps(LENGTH_STEP, ANGLE_STEP)
-        known = dict(zip(coordinates.names, largest, strict=True))
+            travel = speeds * spans
+            deviation = accelerations * spans**2 / 8.0
+        max_steps = self._list_max_steps()
+        planar = np.linalg.norm(travel[:, :2], axis=1) / LENGTH_STEP
+        single = (travel / max_steps).max(axis=1)
+        bent = np.sqrt((deviation / (CHORD_DEVIATION * max_steps)).max(axis=1))
+        most = np.maximum.reduce([planar, single, bent])
+        return np.asarray(np.maximum(1, np.ceil(most - _COUNT_ROUNDING)))
+
+    def _list_max_steps(self) -> Floats:
+        """Return the largest step between two samples for each coordinate, shape (n,)."""
+        coordinates = self.world.coordinates
+        of_world = coordinates.compute_max_steps(LENGTH_STEP, ANGLE_STEP)
+        known = dict(zip(coordinates.names, of_world, strict=True))
+        by_unit = {"m": LENGTH_STEP, "rad": ANGLE_STEP}
         names = self.trajectory.names
-        units = np.array([known.get(name, default[self.get_unit(name)]) for name in names])
-        planar = np.linalg.norm(steps[:, :2], axis=1) / LENGTH_STEP
-        bent = np.sqrt((bends / (CHORD_DEVIATION * units)).max(axis=1))
-        counts = np.maximum(
-            1, np.ceil(np.maximum.reduce([planar, (steps / units).max(axis=1), bent]) - 1e-9)
-        )
-        self.required_count = float(counts.sum())
-        self.is_truncated = self.required_count > max(MAX_SAMPLES, len(counts))
-        counts = np.ones(len(counts), int) if self.is_truncated else counts.astype(int)
-        rows = np.concatenate([[0], np.cumsum(counts)])
-        numbers = np.arange(rows[-1]) - np.repeat(rows[:-1], counts)
-        times = np.repeat(edges[:-1], counts) + numbers * np.repeat(np.diff(edges) / counts, counts)
-        return np.append(times, edges[-1]), rows[np.searchsorted(edges, self.trajectory.times)]
+        return np.array([known.get(name, by_unit[self.get_unit(name)]) for name in names])
 
     def get_unit(self, name: str) -> str:
         """Return the unit of a coordinate, "m" or "rad"."""
@@ -215,17 +261,21 @@ class Samples:
                 lower = upper = float(self.scene.start[i])
             if i < 2:
                 begin, end = self.scene.arena[2 * i : 2 * i + 2]
-                lower, upper = max(lower, begin), min(upper, end)
+                lower = max(lower, begin)
+                upper = min(upper, end)
             return lower, upper, float(robot.velocity[i]), float(robot.acceleration[i])
         if name in self.grasp_freedoms:
-            return self.grasp_freedoms[name].lower, self.grasp_freedoms[name].upper, np.inf, np.inf
+            freedom = self.grasp_freedoms[name]
+            return freedom.lower, freedom.upper, np.inf, np.inf
         owner, _, joint = name.partition(".")
         item = self.scene.objects[owner].object
-        i, limits = item.coordinates.index(joint), (item.lower, item.upper)
-        lower, upper, velocity, acceleration = (
-            float(values[i]) for values in (*limits, item.velocity, item.acceleration)
+        i = item.coordinates.index(joint)
+        return (
+            float(item.lower[i]),
+            float(item.upper[i]),
+            float(item.velocity[i]),
+            float(item.acceleration[i]),
         )
-        return lower, upper, velocity, acceleration
 
     def find_waypoint(self, row: int) -> int:
         """Return the last waypoint at or before a sample."""
@@ -237,7 +287,8 @@ class Samples:
 
     def find_driven_coordinates(self, holds: Iterable[Hold]) -> set[str]:
         """Return the object coordinates that holds drive: the joints from base to attachment."""
-        model, names = self.world.model, set()
+        model = self.world.model
+        names = set[str]()
         for hold in holds:
             link = self.scene.objects[hold.object].object.attachments[hold.attachment].link
             joint = model.frames[model.getFrameId(f"{hold.object}.{link}")].parentJoint
@@ -248,20 +299,24 @@ class Samples:
 
     def compute_placements(self, rows: Iterable[int], frame: str) -> list[pin.SE3]:
         """Return the placements of a frame in the world at the given samples."""
-        turns, origins = self._compute_frames(self.z[np.asarray(rows)], frame)
-        return [pin.SE3(*both) for both in zip(turns[:, 0], origins[:, 0], strict=True)]
+        rotations, origins = self._compute_frames(self.z[np.asarray(rows)], frame)
+        poses = zip(rotations[:, 0], origins[:, 0], strict=True)
+        return [pin.SE3(rotation, origin) for rotation, origin in poses]
 
     def _compute_frames(self, z: Floats, *names: str) -> tuple[Floats, Floats]:
         """Compute rotations, shape (K, F, 3, 3), and origins, shape (K, F, 3) [m], of F frames."""
-        model, data = self.world.model, self.world.model.createData()
+        model = self.world.model
+        data = model.createData()
         frames = [model.getFrameId(name) for name in names]
-        turns, origins = np.empty((len(z), len(frames), 3, 3)), np.empty((len(z), len(frames), 3))
+        rotations = np.empty((len(z), len(frames), 3, 3))
+        origins = np.empty((len(z), len(frames), 3))
         for k, q in enumerate(self.world.coordinates.q(z)):
             pin.forwardKinematics(model, data, q)
             for f, frame in enumerate(frames):
-                placed = pin.updateFramePlacement(model, data, frame)
-                turns[k, f], origins[k, f] = placed.rotation, placed.translation
-        return turns, origins
+                placement = pin.updateFramePlacement(model, data, frame)
+                rotations[k, f] = placement.rotation
+                origins[k, f] = placement.translation
+        return rotations, origins
 
     def compute_grasp_errors(self, hold: Hold, rows: Ints) -> Floats:
         """Compute position [m] and angle [rad] errors of a grasp at samples, shape (K, 2)."""
@@ -273,42 +328,71 @@ class Samples:
         return self._compute_grasp_errors(hold, times, z)
 
     def _compute_grasp_errors(self, hold: Hold, times: Floats, z: Floats) -> Floats:
-        owner, attachment = hold.object, get_attachment(self.scene.objects, hold)
+        """Compute the errors at times, shape (K,), with the world's coordinates there, (K, n).
+
+        The hand H holds the link L at the attachment's tool frame A. In the world frame the
+        position error is |p_H − (p_L + R_L p_A)|, the rotation from A to H is (R_L R_A)ᵀ R_H.
+        """
+        owner = hold.object
+        attachment = get_attachment(self.scene.objects, hold)
+        holder_frame = hold.frame or self.scene.robot.tool_frame
+        link_frame = f"{owner}.{attachment.link}"
+        rotations, origins = self._compute_frames(z, holder_frame, link_frame)
         hand = compute_hand_frame(self.scene.robot, attachment)
-        turns, origins = self._compute_frames(
-            z, hold.frame or self.scene.robot.tool_frame, f"{owner}.{attachment.link}"
+        hand_origins = origins[:, 0] + rotations[:, 0] @ hand.translation
+        link_origins = origins[:, 1]
+        link_rotations = rotations[:, 1]
+        tool_rotations, tool_origins = _compute_tools(
+            attachment, self._get_grasp_values(owner, attachment, times)
         )
-        positions, names = self.trajectory.at(times), self.trajectory.names
+        targets = link_origins + np.einsum("kij,kj->ki", link_rotations, tool_origins)
+        offsets = hand_origins - targets
+        target_rotations = link_rotations @ tool_rotations
+        errors = np.swapaxes(target_rotations, 1, 2) @ rotations[:, 0] @ hand.rotation
+        return np.column_stack([np.linalg.norm(offsets, axis=1), _compute_angles(errors)])
+
+    def _get_grasp_values(self, owner: str, attachment: Attachment, times: Floats) -> Floats:
+        """Return the coordinates of a grasp at times, shape (K, freedoms); 0 where unplanned."""
+        names = self.trajectory.names
+        positions = self.trajectory.at(times)
         values = np.zeros((len(times), len(attachment.coordinates)))
         for column, suffix in enumerate(attachment.coordinates):
-            if f"{owner}.{suffix}" in names:
-                values[:, column] = positions[:, names.index(f"{owner}.{suffix}")]
-        turn, origin = _compute_tools(attachment, values)
-        aimed = origins[:, 1] + np.einsum("kij,kj->ki", turns[:, 1], origin)
-        off = origins[:, 0] + turns[:, 0] @ hand.translation - aimed
-        rotation = np.swapaxes(turns[:, 1] @ turn, 1, 2) @ turns[:, 0] @ hand.rotation
-        return np.column_stack([np.linalg.norm(off, axis=1), _compute_angles(rotation)])
+            name = f"{owner}.{suffix}"
+            if name in names:
+                values[:, column] = positions[:, names.index(name)]
+        return values
 
 
 def _compute_tools(attachment: Attachment, values: Floats) -> tuple[Floats, Floats]:
-    """Compute `Attachment.tool` for K rows of values: rotations (K, 3, 3), origins (K, 3) [m]."""
-    turns = np.broadcast_to(attachment.placement.rotation, (len(values), 3, 3))
+    """Compute `Attachment.tool` for K rows of values: rotations (K, 3, 3), origins (K, 3) [m].
+
+    A revolute freedom of angle θ about the unit axis a through the point c turns by
+    R = I + sin θ [a] + (1 − cos θ) [a]² (Rodrigues) and moves the origin to c − R c. A prismatic
+    one displaces it by its value along a.
+    """
+    rotations = np.broadcast_to(attachment.placement.rotation, (len(values), 3, 3))
     origins = np.broadcast_to(attachment.placement.translation, (len(values), 3))
-    for freedom, steps in zip(attachment.freedoms, values.T, strict=True):
+    for freedom, amounts in zip(attachment.freedoms, values.T, strict=True):
         if freedom.unit == "rad":
-            cross, amounts = pin.skew(freedom.axis), steps[:, None, None]
-            turn = np.eye(3) + np.sin(amounts) * cross + (1.0 - np.cos(amounts)) * cross @ cross
-            shifts = freedom.through - turn @ freedom.through
+            cross = pin.skew(freedom.axis)
+            angles = amounts[:, None, None]
+            rotation = np.eye(3) + np.sin(angles) * cross + (1.0 - np.cos(angles)) * cross @ cross
+            shifts = freedom.through - rotation @ freedom.through
         else:
-            turn, shifts = np.eye(3), steps[:, None] * freedom.axis
-        origins = origins + np.einsum("kij,kj->ki", turns, shifts)
-        turns = turns @ turn
+            rotation = np.eye(3)
+            shifts = amounts[:, None] * freedom.axis
+        origins = origins + np.einsum("kij,kj->ki", rotations, shifts)
+        rotations = rotations @ rotation
     offset = attachment.offset
-    return turns @ offset.rotation, origins + turns @ offset.translation
+    return rotations @ offset.rotation, origins + rotations @ offset.translation
 
 
 def _compute_angles(rotations: Floats) -> Floats:
-    """Compute rotation angles, shape (K, 3, 3) → (K,) [rad]; accurate near 0 and near π."""
+    """Compute rotation angles, shape (K, 3, 3) → (K,) [rad]; accurate near 0 and near π.
+
+    R − Rᵀ = 2 sin θ [a] and tr R = 1 + 2 cos θ.
+    """
     skew = rotations - np.swapaxes(rotations, 1, 2)
     sine = 0.5 * np.linalg.norm(skew[:, [2, 0, 1], [1, 2, 0]], axis=1)
-    return np.arctan2(sine, 0.5 * (np.trace(rotations, axis1=1, axis2=2) - 1.0))
+    cosine = 0.5 * (np.trace(rotations, axis1=1, axis2=2) - 1.0)
+    return np.arctan2(sine, cosine)

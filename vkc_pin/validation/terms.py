@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pinocchio as pin
@@ -13,7 +12,8 @@ from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
 from vkc_pin.world.task.terms import Constraint, Formula, Term
 
-INTERMEDIATE_FACTOR = 10.0  # tolerance between waypoints over that at waypoints
+# tolerance between waypoints over that at waypoints
+INTERMEDIATE_FACTOR = 10.0
 
 
 def check_terms(samples: Samples, terms: Sequence[Term]) -> list[Violation]:
@@ -25,94 +25,102 @@ def check_terms(samples: Samples, terms: Sequence[Term]) -> list[Violation]:
     order in the step, so ten times the tolerance is accepted. Velocities are differences over the
     duration of the current segment, so that they are continuous at waypoints.
     """
-    found = []
-    for term in (term for term in terms if isinstance(term, Constraint)):
-        at, between = _find_rows(samples, term)
-        rows = np.sort(np.concatenate([at, between]))
-        if not len(rows):
-            continue
-        values = term.formula.evaluate(_compute_inputs(samples, term.formula, rows))
-        lower, upper = term.compute_bounds(term.formula.rows)
-        excess = np.maximum(lower - values, values - upper)
-        excess[np.isnan(excess)] = np.inf
-        for which, tolerance in (
-            (at, term.tolerance),
-            (between, INTERMEDIATE_FACTOR * term.tolerance),
-        ):
-            mine = np.flatnonzero(np.isin(rows, which))
-            if not len(mine):
-                continue
-            k, entry = (
-                int(i) for i in np.unravel_index(np.argmax(excess[mine]), (len(mine), len(lower)))
-            )
-            row, amount = int(rows[mine[k]]), float(excess[mine[k], entry])
-            if amount <= tolerance:
-                continue
-            value = float(values[mine[k], entry])
-            side = (
-                f"less than {lower[entry]:.6g}"
-                if value < lower[entry]
-                else f"more than {upper[entry]:.6g}"
-            )
-            name = f"entry {entry}: " if len(lower) > 1 else ""
-            where = " between waypoints" if which is between else ""
-            detail = f"{name}{value:.6g} is {side} by {amount:.3g}{where}"
-            found.append(samples.make_violation("term", term.name, amount, "", detail, row=row))
+    found: list[Violation] = []
+    for term in terms:
+        if isinstance(term, Constraint):
+            found += _check_constraint(samples, term)
     return found
+
+
+def _check_constraint(samples: Samples, term: Constraint) -> Iterator[Violation]:
+    """Yield the worst violation of a constraint at waypoints, and the worst between them."""
+    at, between = _find_rows(samples, term)
+    rows = np.sort(np.concatenate([at, between]))
+    if not len(rows):
+        return
+    values = term.formula.evaluate(_compute_inputs(samples, term.formula, rows))
+    lower, upper = term.compute_bounds(term.formula.rows)
+    excess = np.maximum(lower - values, values - upper)
+    excess[np.isnan(excess)] = np.inf
+    parts = [
+        (at, term.tolerance, ""),
+        (between, INTERMEDIATE_FACTOR * term.tolerance, " between waypoints"),
+    ]
+    for which, tolerance, where in parts:
+        mine = np.flatnonzero(np.isin(rows, which))
+        if not len(mine):
+            continue
+        worst = int(np.argmax(excess[mine]))
+        k, entry = divmod(worst, len(lower))
+        amount = float(excess[mine[k], entry])
+        if amount <= tolerance:
+            continue
+        value = float(values[mine[k], entry])
+        if value < lower[entry]:
+            side = f"less than {lower[entry]:.6g}"
+        else:
+            side = f"more than {upper[entry]:.6g}"
+        name = f"entry {entry}: " if len(lower) > 1 else ""
+        detail = f"{name}{value:.6g} is {side} by {amount:.3g}{where}"
+        row = int(rows[mine[k]])
+        yield samples.make_violation("term", term.name, amount, "", detail, row=row)
 
 
 def _find_rows(samples: Samples, term: Constraint) -> tuple[Ints, Ints]:
     """Return the samples at which a constraint must hold: at waypoints, and between them."""
     trajectory = samples.trajectory
-    asked = np.zeros(len(trajectory.times), bool)
+    positions = trajectory.positions
+    is_asked = np.zeros(len(trajectory.times), bool)  # at each waypoint
     for phase in trajectory.phases:
-        if term.is_active(phase.name, phase.held):
-            inside = slice(phase.first + 1, phase.last + 1)
-            left = (
-                np.abs(trajectory.positions[inside] - trajectory.positions[phase.first]).max(axis=1)
-                > 0.0
-            )
-            asked[inside] = np.logical_or.accumulate(left) | asked[phase.first]
-            asked[phase.last] |= phase.first > 0 or bool(left.any())
-    at = samples.waypoint_rows[asked]
-    edges = itertools.pairwise(samples.waypoint_rows.tolist())
-    inner = [
-        np.arange(a + 1, b)
-        for (a, b), both in zip(edges, asked[1:] & asked[:-1], strict=True)
-        if both
-    ]
-    return at, np.concatenate([np.zeros(0, int), *inner])
+        if not term.is_active(phase.name, phase.held):
+            continue
+        inside = slice(phase.first + 1, phase.last + 1)
+        moved = np.abs(positions[inside] - positions[phase.first]).max(axis=1)
+        has_left = np.logical_or.accumulate(moved > 0.0)
+        is_asked[inside] = has_left | is_asked[phase.first]
+        is_asked[phase.last] |= phase.first > 0 or bool(has_left.any())
+    at = samples.waypoint_rows[is_asked]
+    between = [np.zeros(0, int)]
+    for waypoint in np.flatnonzero(is_asked[1:] & is_asked[:-1]):
+        begin, end = samples.waypoint_rows[waypoint : waypoint + 2]
+        between.append(np.arange(begin + 1, end))
+    return at, np.concatenate(between)
 
 
 def _compute_inputs(samples: Samples, formula: Formula, rows: Ints) -> Floats:
     """Compute the inputs of a formula at samples, shape (S, 2·half + 1)."""
+    trajectory = samples.trajectory
+    begin = trajectory.times[0]
     # The waypoint at which the segment of each sample ends.
     ends = np.searchsorted(samples.waypoint_rows, rows)
-    dt = np.diff(samples.trajectory.times, prepend=samples.trajectory.times[0] - 1.0)[ends]
-    now = before = _compute_state_inputs(samples, formula, samples.z[rows])
+    # Duration of each segment [s]; 1 s for the first waypoint, which ends none.
+    dt = np.diff(trajectory.times, prepend=begin - 1.0)[ends]
+    now = _compute_state_inputs(samples, formula, samples.z[rows])
+    before = now
     if formula.uses_previous:
         times = samples.times[rows] - dt
         order = np.argsort(times, kind="stable")
+        ordered = np.maximum(times[order], begin)
         earlier = np.empty((len(rows), samples.z.shape[1]))
-        earlier[order] = samples.world.compute_positions(
-            samples.trajectory, np.maximum(times[order], samples.trajectory.times[0])
-        )
+        earlier[order] = samples.world.compute_positions(trajectory, ordered)
         before = _compute_state_inputs(samples, formula, earlier)
     return np.column_stack([now, before, dt])
 
 
 def _compute_state_inputs(samples: Samples, formula: Formula, z: Floats) -> Floats:
     """Compute a formula's frame placements and coordinates at configurations, shape (S, half)."""
-    model, coordinates = samples.world.model, samples.world.coordinates
+    model = samples.world.model
+    coordinates = samples.world.coordinates
     data = model.createData()
     frames = [model.getFrameId(name) for name in formula.frames]
-    found = np.empty((len(z), formula.state_size))
-    for row, q in zip(found, coordinates.q(z) if frames else (), strict=False):
-        pin.forwardKinematics(model, data, q)
-        for k, frame in enumerate(frames):
-            placement = pin.updateFramePlacement(model, data, frame)
-            row[12 * k : 12 * k + 9] = placement.rotation.T.ravel()
-            row[12 * k + 9 : 12 * k + 12] = placement.translation
+    inputs = np.empty((len(z), formula.state_size))
+    if frames:
+        for row, q in zip(inputs, coordinates.q(z), strict=True):
+            pin.forwardKinematics(model, data, q)
+            for k, frame in enumerate(frames):
+                placement = pin.updateFramePlacement(model, data, frame)
+                row[12 * k : 12 * k + 9] = placement.rotation.T.ravel()
+                row[12 * k + 9 : 12 * k + 12] = placement.translation
     for k, name in enumerate(formula.coordinates, start=12 * len(frames)):
-        found[:, k] = z[:, coordinates.index(name)]
-    return found
+        inputs[:, k] = z[:, coordinates.index(name)]
+    return inputs

@@ -28,6 +28,7 @@ from vkc_pin.validation.report import Exemption, Report, Violation
 from vkc_pin.validation.samples import MAX_SAMPLES, Samples
 from vkc_pin.validation.terms import check_terms
 from vkc_pin.validation.tolerances import Tolerances
+from vkc_pin.world.models.articulated_object import Latch
 from vkc_pin.world.models.shapes import START_SLACK
 from vkc_pin.world.scene.clearance_exemptions import ACCEPTED_SHORTFALL, CONTACT_DEPTH
 from vkc_pin.world.scene.scene import Scene
@@ -37,9 +38,14 @@ from vkc_pin.world.task.terms import Term, trace_terms
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-START_TOLERANCE = 1e-9  # difference from the scene's start [m] or [rad]
-LIMIT_TOLERANCE = 1e-5  # excess over a position limit [m] or [rad]
+# difference from the scene's start [m] or [rad]
+START_TOLERANCE = 1e-9
+# excess over a position limit [m] or [rad]
+LIMIT_TOLERANCE = 1e-5
+# displacement of a latched joint, and shortfall of the releasing one [m] or [rad]
 LATCH_TOLERANCE = 1e-4
+# smaller displacements of a latched joint are rounding errors [m] or [rad]
+_LATCH_ROUNDING = 1e-12
 
 
 def validate(
@@ -97,33 +103,24 @@ def validate(
     violations += loads.violations
     drift = _check_closure(samples, tolerances, violations)
     violations += _check_firm_grasps(samples)
-    clearances = np.full(len(trajectory.phases), np.inf)
-    exemptions: dict[tuple[str, str], Exemption] = {}
-    if excess := list(_check_sample_count(samples)):
+    excess = list(_check_sample_count(samples))
+    if excess:
         violations += excess
+        clearance = _ClearanceCheck(samples)
     else:
-        solids = CollisionShapes(samples.world)
-        windows = find_contact_windows(samples, solids, asked, options, tolerances)
-        pairs = PairTable(
-            scene,
-            solids,
-            trajectory,
-            options.dist_safe,
-            options.self_distance,
-            windows=windows,
-            samples=samples,
-        )
-        _check_clearance(pairs, samples, options, violations, clearances, exemptions)
+        clearance = _check_clearance(samples, asked, options, tolerances)
+        violations += clearance.violations
+    motor_fields = motors.summarize(options.jerk_time)
     return Report(
         _select_worst(violations),
-        float(min(clearances)),
+        float(min(clearance.smallest)),
         closure_error=float(drift[0]),
         closure_angle=float(drift[1]),
-        clearances=tuple(clearances.tolist()),
+        clearances=tuple(clearance.smallest.tolist()),
         states=len(samples.times),
-        exemptions=tuple(exemptions.values()),
+        exemptions=tuple(clearance.exemptions.values()),
         allowed=loads.allowed,
-        **motors.summarize(options.jerk_time),
+        **motor_fields,
     )
 
 
@@ -153,26 +150,34 @@ def _select_worst(violations: Sequence[Violation]) -> tuple[Violation, ...]:
 
 def _check_sample_count(samples: Samples) -> Iterator[Violation]:
     """Yield a violation if the motion is too long to be checked for collisions."""
-    motion, needed = samples.trajectory, samples.required_count
+    motion = samples.trajectory
+    required = samples.required_count
     most = max(MAX_SAMPLES, len(motion.times))
-    if needed > most:
-        detail = f"{needed:.3g} samples are required, more than {most}: collisions not checked"
-        step = int(np.argmax(np.abs(np.diff(motion.positions, axis=0)).max(axis=1)))
+    if required > most:
+        detail = f"{required:.3g} samples are required, more than {most}: collisions not checked"
+        steps = np.abs(np.diff(motion.positions, axis=0)).max(axis=1)
         yield samples.make_violation(
-            "sampling", "motion", needed - most, "configurations", detail, waypoint=step
+            "sampling",
+            "motion",
+            required - most,
+            "configurations",
+            detail,
+            waypoint=int(np.argmax(steps)),
         )
 
 
 def _check_start(samples: Samples) -> Iterator[Violation]:
-    motion, world = samples.trajectory, samples.world
-    known = dict(zip(world.coordinates.names, world.start, strict=True))
+    """Check that a motion begins where the scene's robot and objects are."""
+    motion = samples.trajectory
+    world = samples.world
+    start = dict(zip(world.coordinates.names, world.start, strict=True))
     for name, value in zip(motion.names, motion.positions[0], strict=True):
-        right, unit = known.get(name, value), samples.get_unit(name)
-        if not abs(value - right) <= START_TOLERANCE:
-            detail = f"{value:.6g} {unit} instead of {right:.6g} {unit}"
-            yield samples.make_violation(
-                "start", name, abs(value - right), unit, detail, waypoint=0
-            )
+        expected = start.get(name, value)
+        unit = samples.get_unit(name)
+        difference = abs(value - expected)
+        if not difference <= START_TOLERANCE:
+            detail = f"{value:.6g} {unit} instead of {expected:.6g} {unit}"
+            yield samples.make_violation("start", name, difference, unit, detail, waypoint=0)
 
 
 def _check_limits(samples: Samples) -> Iterator[Violation]:
@@ -182,33 +187,55 @@ def _check_limits(samples: Samples) -> Iterator[Violation]:
     inside, any other coordinate at the start alone.
     """
     motion = samples.trajectory
+    all_low, all_high = samples.ranges
     for i, name in enumerate(motion.names):
-        (low, high), start = (side[:, i] for side in samples.ranges), motion.positions[0, i]
+        low = all_low[:, i]
+        high = all_high[:, i]
+        start = motion.positions[0, i]
         lower, upper, _, _ = samples.get_limits(name)
-        begin = max(lower - start, start - upper)
-        excess = np.maximum(lower - low, high - upper)
-        if 0.0 < begin <= START_SLACK + START_TOLERANCE:
-            is_inside = (motion.positions[1:, i] >= lower) & (motion.positions[1:, i] <= upper)
-            if i >= motion.robot_size:
-                entered = 0
-            else:
+        start_excess = max(lower - start, start - upper)
+        excess = np.maximum(lower - low, high - upper)  # in each segment
+        if 0.0 < start_excess <= START_SLACK + START_TOLERANCE:
+            entered = 0  # the segment at whose end the coordinate is first inside
+            if i < motion.robot_size:
+                is_inside = (motion.positions[1:, i] >= lower) & (motion.positions[1:, i] <= upper)
                 entered = int(np.argmax(is_inside)) if is_inside.any() else len(excess)
-            excess[: entered + 1] -= begin
+            excess[: entered + 1] -= start_excess
         worst = int(np.argmax(excess))
         if not excess[worst] <= LIMIT_TOLERANCE:
-            value = float(max(low[worst], high[worst], key=lambda v: max(lower - v, v - upper)))
-            out, unit = max(lower - value, value - upper), samples.get_unit(name)
-            at = worst + int(np.argmin(np.abs(motion.positions[worst : worst + 2, i] - value)))
-            limits = f"{lower:.4f} to {upper:.4f} {unit}"
-            detail = f"{value:.4f} {unit} is outside {limits} by {out:.4f} {unit}"
-            yield samples.make_violation("limit", name, out, unit, detail, waypoint=at)
+            yield _make_limit_violation(samples, i, worst, (lower, upper))
+
+
+def _make_limit_violation(
+    samples: Samples, column: int, segment: int, limits: tuple[float, float]
+) -> Violation:
+    """Make the violation of a coordinate's position limits in a segment."""
+    motion = samples.trajectory
+    name = motion.names[column]
+    unit = samples.get_unit(name)
+    lower, upper = limits
+    low, high = (float(side[segment, column]) for side in samples.ranges)
+    low_excess = max(lower - low, low - upper)
+    high_excess = max(lower - high, high - upper)
+    if high_excess > low_excess:
+        value = high
+        amount = high_excess
+    else:
+        value = low
+        amount = low_excess
+    ends = motion.positions[segment : segment + 2, column]
+    waypoint = segment + int(np.argmin(np.abs(ends - value)))
+    span = f"{lower:.4f} to {upper:.4f} {unit}"
+    detail = f"{value:.4f} {unit} is outside {span} by {amount:.4f} {unit}"
+    return samples.make_violation("limit", name, amount, unit, detail, waypoint=waypoint)
 
 
 def _check_tilt(samples: Samples) -> Iterator[Violation]:
     """Check that objects on moving links stay as upright as they were when last put down."""
-    phases, objects = samples.trajectory.phases, samples.scene.objects
+    objects = samples.scene.objects
+    phases = zip(samples.trajectory.phases, samples.free_objects.supports, strict=True)
     put_down: dict[str, pin.SE3] = {}
-    for phase, supported in zip(phases, samples.free_objects.supports, strict=True):
+    for phase, supported in phases:
         put_down = {name: there for name, there in put_down.items() if name not in phase.held}
         rows = samples.get_rows(phase)
         for owner, label in supported.items():
@@ -217,11 +244,12 @@ def _check_tilt(samples: Samples) -> Iterator[Violation]:
             begin = put_down.setdefault(owner, placements[0])
             angles = np.array([compute_tilt(begin, placement) for placement in placements])
             worst = int(np.argmax(angles))
-            if not angles[worst] <= MAX_TILT:
-                angle = f"{angles[worst]:.2f} rad, more than {MAX_TILT:g} rad"
-                detail = f"its support '{label}' tilts it by {angle}, since it was put down"
+            angle = angles[worst]
+            if not angle <= MAX_TILT:
+                tilt = f"{angle:.2f} rad, more than {MAX_TILT:g} rad"
+                detail = f"its support '{label}' tilts it by {tilt}, since it was put down"
                 yield samples.make_violation(
-                    "tips", owner, angles[worst] - MAX_TILT, "rad", detail, row=int(rows[worst])
+                    "tips", owner, angle - MAX_TILT, "rad", detail, row=int(rows[worst])
                 )
 
 
@@ -229,14 +257,14 @@ def _check_undriven_joints(samples: Samples) -> Iterator[Violation]:
     """Check that object joints that no hand drives do not move."""
     motion = samples.trajectory
     for phase in motion.phases:
-        driven = samples.find_driven_coordinates(phase.holds) | samples.grasp_freedoms.keys()
+        driven = samples.find_driven_coordinates(phase.holds)
         for name in motion.names[motion.robot_size :]:
-            if name not in driven:
-                owner = name.partition(".")[0]
-                why = "no hold drives it" if owner in phase.held else f"{owner} is not grasped"
-                yield from _check_stationary(
-                    samples, phase, "unheld", name, f"moves by {{}} while {why}"
-                )
+            if name in driven or name in samples.grasp_freedoms:
+                continue
+            owner = name.partition(".")[0]
+            why = "no hold drives it" if owner in phase.held else f"{owner} is not grasped"
+            detail = f"moves by {{}} while {why}"
+            yield from _check_stationary(samples, phase, "unheld", name, detail)
 
 
 def _check_firm_grasps(samples: Samples) -> Iterator[Violation]:
@@ -244,8 +272,10 @@ def _check_firm_grasps(samples: Samples) -> Iterator[Violation]:
     for phase in samples.trajectory.phases:
         for owner, attachment in phase.held.items():
             grasp = samples.scene.objects[owner].object.attachments[attachment]
+            if not grasp.firm:
+                continue
             detail = f"the hand moves on '{owner}' by {{}} while it clamps it"
-            for name in grasp.coordinates if grasp.firm else ():
+            for name in grasp.coordinates:
                 yield from _check_stationary(samples, phase, "slide", f"{owner}.{name}", detail)
 
 
@@ -256,7 +286,8 @@ def _check_stationary(
     column = samples.trajectory.names.index(name)
     begin = samples.trajectory.positions[phase.first, column]
     low, high = (side[phase.first : phase.last, column] for side in samples.ranges)
-    moved, unit = np.maximum(high - begin, begin - low), samples.get_unit(name)
+    moved = np.maximum(high - begin, begin - low)
+    unit = samples.get_unit(name)
     worst = int(np.argmax(moved))
     if not moved[worst] <= MOTION_TOLERANCE:
         text = detail.format(f"{moved[worst]:.4f} {unit}")
@@ -265,112 +296,164 @@ def _check_stationary(
 
 
 def _check_latches(samples: Samples) -> Iterator[Violation]:
-    """Check that a latched joint leaves its latched position only while its latch is released.
-
-    Between two samples both joints are linear in time. The shortfall of the releasing joint is
-    therefore largest where the latched joint starts to move or leaves the latch's range.
-    """
-    z, names = samples.z, samples.world.coordinates
+    """Check that a latched joint leaves its latched position only while its latch is released."""
     for owner, placed in samples.scene.objects.items():
         for latch in placed.object.latches:
-            name, release = f"{owner}.{latch.joint}", f"{owner}.{latch.released_by}"
-            off = z[:, names.index(name)] - latch.held_at
-            before, after = np.abs(off[:-1]), np.abs(off[1:])
-            crossed = off[:-1] * off[1:] < 0  # passes the latched position
-            begin = np.where(crossed, before / np.where(crossed, before + after, 1.0), 0.0)
-            reach = np.where(crossed, 0.0, before)
-            moves = (after > reach + 1e-12) & (after > LATCH_TOLERANCE)
-            leaves = moves & (reach <= latch.engaged_within)
-            share = (latch.engaged_within - reach) / np.where(leaves, after - reach, 1.0)
-            end = np.where(leaves, begin + np.clip(share, 0.0, 1.0) * (1 - begin), begin)
-            value, change = z[:-1, names.index(release)], np.diff(z[:, names.index(release)])
-            lowest = value + np.minimum(begin * change, end * change)
-            short = np.where(leaves, latch.threshold - lowest, 0.0)
-            row = int(np.argmax(short))
-            if not short[row] <= LATCH_TOLERANCE:
-                detail = (
-                    f"leaves {latch.held_at:g} while {latch.released_by} is at {lowest[row]:.3f}, "
-                    f"{short[row]:.3f} short of {latch.threshold:g}"
-                )
-                unit = samples.get_unit(release)
-                yield samples.make_violation("latch", name, short[row], unit, detail, row=row)
+            yield from _check_latch(samples, owner, latch)
+
+
+def _check_latch(samples: Samples, owner: str, latch: Latch) -> Iterator[Violation]:
+    """Yield the worst violation of a latch.
+
+    Between two samples both joints are linear in time. The shortfall of the releasing joint is
+    therefore largest where the latched joint starts to move or leaves the latch's range. These two
+    are fractions of the interval, `begin` and `end`.
+    """
+    z = samples.z
+    coordinates = samples.world.coordinates
+    name = f"{owner}.{latch.joint}"
+    release = f"{owner}.{latch.released_by}"
+    offset = z[:, coordinates.index(name)] - latch.held_at
+    before = np.abs(offset[:-1])
+    after = np.abs(offset[1:])
+    crosses = offset[:-1] * offset[1:] < 0  # the latched position
+    begin = np.where(crosses, before / np.where(crosses, before + after, 1.0), 0.0)
+    begin_offset = np.where(crosses, 0.0, before)
+    moves = (after > begin_offset + _LATCH_ROUNDING) & (after > LATCH_TOLERANCE)
+    leaves = moves & (begin_offset <= latch.engaged_within)
+    moved = np.where(leaves, after - begin_offset, 1.0)
+    engaged = np.clip((latch.engaged_within - begin_offset) / moved, 0.0, 1.0)
+    end = np.where(leaves, begin + engaged * (1 - begin), begin)
+    releasing = z[:, coordinates.index(release)]
+    change = np.diff(releasing)
+    lowest = releasing[:-1] + np.minimum(begin * change, end * change)
+    shortfall = np.where(leaves, latch.threshold - lowest, 0.0)
+    row = int(np.argmax(shortfall))
+    if not shortfall[row] <= LATCH_TOLERANCE:
+        detail = (
+            f"leaves {latch.held_at:g} while {latch.released_by} is at {lowest[row]:.3f}, "
+            f"{shortfall[row]:.3f} short of {latch.threshold:g}"
+        )
+        unit = samples.get_unit(release)
+        yield samples.make_violation("latch", name, shortfall[row], unit, detail, row=row)
 
 
 def _check_closure(samples: Samples, tolerances: Tolerances, violations: list[Violation]) -> Floats:
     """Add violations of grasp closure (eq. 2); return the largest drift, [m] and [rad]."""
-    largest, limits = np.zeros(2), (tolerances.closure_position, tolerances.closure_angle)
+    largest = np.zeros(2)
+    limits = (tolerances.closure_position, tolerances.closure_angle)
     for phase in samples.trajectory.phases:
         for hold in phase.holds:
             drift = find_drift(samples, phase, hold, limits)
             largest = np.maximum(largest, drift.measured)
-            for found, bound, time, limit, unit in zip(*drift, limits, ("m", "rad"), strict=True):
-                if not bound <= limit:
-                    amount = found if found > limit else bound
-                    excess = f"{1e3 * amount:.3f} m{unit}, more than {1e3 * limit:g} m{unit}"
-                    detail = f"the grasp drifts by {excess}"
-                    subject = f"{hold.object}.{hold.attachment}"
-                    violations.append(
-                        samples.make_violation(
-                            "closure", subject, amount - limit, unit, detail, time=time
-                        )
+            parts = zip(*drift, limits, ("m", "rad"), strict=True)
+            for measured, bound, time, limit, unit in parts:
+                if bound <= limit:
+                    continue
+                amount = measured if measured > limit else bound
+                excess = f"{1e3 * amount:.3f} m{unit}, more than {1e3 * limit:g} m{unit}"
+                violations.append(
+                    samples.make_violation(
+                        "closure",
+                        f"{hold.object}.{hold.attachment}",
+                        amount - limit,
+                        unit,
+                        f"the grasp drifts by {excess}",
+                        time=time,
                     )
+                )
     return largest
 
 
+class _ClearanceCheck:
+    """Result of the check of clearances and penetrations.
+
+    Attributes:
+        violations: All violations.
+        smallest: Smallest distance of each phase [m]; infinite without a pair.
+        exemptions: Used exemptions by the labels of their shapes.
+    """
+
+    def __init__(self, samples: Samples) -> None:
+        self._samples = samples
+        self._lasts = [phase.last for phase in samples.trajectory.phases]
+        self.violations: list[Violation] = []
+        self.smallest = np.full(len(self._lasts), np.inf)
+        self.exemptions: dict[tuple[str, str], Exemption] = {}
+
+    def add(self, hit: Hit, exempt: Sequence[ExemptPairs]) -> None:
+        """Judge the distance of a pair, with the exemptions of the pair."""
+        # The exemption also covers the segment before it ends and the one after it begins.
+        state = self._samples.z[[hit.row]]
+        tolerated = 0.0  # overlap [m]
+        for one in exempt:
+            if one.are_active(state)[0]:
+                tolerated = max(tolerated, -one.margin)
+        contact = hit.contact
+        margin = hit.margin
+        if tolerated > 0.0:
+            contact = max(contact, CONTACT_DEPTH + tolerated)
+            margin = min(margin, -tolerated)
+        elif hit.margin > -np.inf:
+            self._add_distance(hit)
+        is_checked = hit.at_waypoint and hit.row > 0
+        shortfall = margin - ACCEPTED_SHORTFALL - hit.distance
+        millimetres = 1e3 * abs(hit.distance)
+        if hit.distance < -contact:
+            detail = f"overlap by {millimetres:.1f} mm"
+            self._add_violation("penetration", hit, -hit.distance, detail)
+        elif is_checked and shortfall > 0.0:
+            required = f"{1e3 * hit.margin:.0f} mm are required"
+            detail = f"are only {millimetres:.1f} mm apart, {required}"
+            self._add_violation("clearance", hit, shortfall, detail)
+        elif hit.distance < -CONTACT_DEPTH or (
+            is_checked and hit.distance < hit.exempt_clearance - ACCEPTED_SHORTFALL
+        ):
+            self._add_exemption(hit, exempt)
+
+    def _add_distance(self, hit: Hit) -> None:
+        phase = bisect.bisect_left(self._lasts, self._samples.find_waypoint(hit.row))
+        self.smallest[phase] = min(self.smallest[phase], hit.distance)
+
+    def _add_violation(self, kind: str, hit: Hit, amount: float, detail: str) -> None:
+        subject = f"{hit.first} – {hit.second}"
+        self.violations.append(
+            self._samples.make_violation(kind, subject, amount, "m", detail, row=hit.row)
+        )
+
+    def _add_exemption(self, hit: Hit, exempt: Sequence[ExemptPairs]) -> None:
+        """Record the smallest distance of a pair that used its exemption."""
+        known = self.exemptions.get((hit.first, hit.second))
+        if known is not None and known.distance <= hit.distance:
+            return
+        reason = exempt[0].reason if exempt else "no deeper than the object at the start"
+        subject = f"{hit.first} – {hit.second}"
+        self.exemptions[hit.first, hit.second] = Exemption(subject, hit.distance, reason)
+
+
 def _check_clearance(
-    pairs: PairTable,
-    samples: Samples,
-    options: Options,
-    violations: list[Violation],
-    nearest: Floats,
-    exemptions: dict[tuple[str, str], Exemption],
-) -> None:
-    """Add violations of clearance at waypoints (eqs. 6 and 7) and penetrations anywhere.
+    samples: Samples, steps: Sequence[Step], options: Options, tolerances: Tolerances
+) -> _ClearanceCheck:
+    """Check the clearance at waypoints (eqs. 6 and 7), and that nothing penetrates anywhere.
 
     Pairs that move together are ignored. At the start the clearance may be violated, since the
-    robot is already there, but nothing may penetrate. The smallest distance of each phase [m] goes
-    to `nearest`, and used exemptions to `exemptions`.
+    robot is already there, but nothing may penetrate.
     """
-    lasts = [phase.last for phase in samples.trajectory.phases]
-    exempt = dict[tuple[int, int], list[ExemptPairs]]()
-    for one in find_exempt_pairs(samples.scene, pairs.solids, options.dist_safe):
+    solids = CollisionShapes(samples.world)
+    pairs = PairTable(
+        samples.scene,
+        solids,
+        samples.trajectory,
+        options.dist_safe,
+        options.self_distance,
+        windows=find_contact_windows(samples, solids, steps, options, tolerances),
+        samples=samples,
+    )
+    exemptions: dict[tuple[int, int], list[ExemptPairs]] = {}
+    for one in find_exempt_pairs(samples.scene, solids, options.dist_safe):
         for first, second in one.pairs.tolist():
-            exempt.setdefault((first, second), []).append(one)
+            exemptions.setdefault((first, second), []).append(one)
+    check = _ClearanceCheck(samples)
     for hit in sweep(pairs, samples.z, samples.waypoint_rows):
-        allowed = exempt.get(hit.shapes, ())
-        # The exemption also covers the segment before it ends and the one after it begins.
-        active = [one for one in allowed if one.are_active(samples.z[[hit.row]])[0]]
-        tolerated = max([0.0, *(-one.margin for one in active)])
-        overlap = max(hit.contact, CONTACT_DEPTH + tolerated if tolerated > 0.0 else 0.0)
-        if hit.margin > -np.inf and not tolerated > 0.0:
-            phase = bisect.bisect_left(lasts, samples.find_waypoint(hit.row))
-            nearest[phase] = min(nearest[phase], hit.distance)
-        is_checked, millimetres = hit.at_waypoint and hit.row > 0, 1e3 * abs(hit.distance)
-        margin = min(hit.margin, -tolerated) if tolerated > 0.0 else hit.margin
-        short = margin - ACCEPTED_SHORTFALL - hit.distance
-        if hit.distance < -overlap:
-            kind, amount, detail = "penetration", -hit.distance, f"overlap by {millimetres:.1f} mm"
-        elif is_checked and short > 0.0:
-            required = f"{1e3 * hit.margin:.0f} mm are required"
-            kind, amount = "clearance", short
-            detail = f"are only {millimetres:.1f} mm apart, {required}"
-        else:
-            if hit.distance < -CONTACT_DEPTH or (
-                is_checked and hit.distance < hit.exempt_clearance - ACCEPTED_SHORTFALL
-            ):
-                _record_exemption(exemptions, hit, allowed)
-            continue
-        subject = f"{hit.first} – {hit.second}"
-        violations.append(samples.make_violation(kind, subject, amount, "m", detail, row=hit.row))
-
-
-def _record_exemption(
-    exemptions: dict[tuple[str, str], Exemption], hit: Hit, allowed: Sequence[ExemptPairs]
-) -> None:
-    """Record the smallest distance of a pair that used its exemption."""
-    known = exemptions.get((hit.first, hit.second))
-    if known is not None and known.distance <= hit.distance:
-        return
-    reason = allowed[0].reason if allowed else "no deeper than the object at the start"
-    subject = f"{hit.first} – {hit.second}"
-    exemptions[hit.first, hit.second] = Exemption(subject, hit.distance, reason)
+        check.add(hit, exemptions.get(hit.shapes, []))
+    return check

@@ -23,10 +23,10 @@ from vkc_pin.datasets.dataset import (
     has_intact_scene,
     read_intact_numbers,
 )
-from vkc_pin.datasets.episode import Made, get_work_file
+from vkc_pin.datasets.episode import get_work_file
 from vkc_pin.datasets.formats import lerobot as lerobot_layout
 from vkc_pin.datasets.formats.card import make_card
-from vkc_pin.datasets.formats.hdf5 import make_parts
+from vkc_pin.datasets.formats.hdf5 import Made, make_parts
 from vkc_pin.datasets.formats.hdf5_reader import require_h5py
 from vkc_pin.datasets.recipe import CAMERAS, Recipe, load_recipe, make_entries
 from vkc_pin.datasets.robots import check_frames, prepare_robots

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, Literal, Self, get_args
 
 from vkc_pin.errors import InputError, format_value
-from vkc_pin.utils.arguments import check_integer, check_number
+from vkc_pin.utils.arguments import check_choice, check_integer, check_mapping, check_number
 
 Objective = Literal["path_length", "control_effort"]
 OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
@@ -120,6 +121,23 @@ class Options:
                 values[item.name] = 1.0
         values.update(changes)
         return cls(**values)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """Return options from plain data, such as those of a saved plan.
+
+        Raises:
+            UnknownNameError: There is no such option.
+            InputError: A value is invalid.
+        """
+        given = check_mapping(data, "options")
+        known = [item.name for item in fields(cls)]
+        for name in given:
+            check_choice(name, known, "option", f"options.{name}")
+        if "dist_safe" in given:
+            # Files without `self_distance` used `dist_safe` for all pairs.
+            given.setdefault("self_distance", given["dist_safe"])
+        return cls(**given)
 
     @property
     def largest_margin(self) -> float:

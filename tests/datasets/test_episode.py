@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.datasets import SMALL
 
-from vkc_pin.datasets.episode import compute_scene_name, pack, run_attempt, unpack
+from vkc_pin.datasets.episode import compute_scene_name, make_episode, run_attempt
 from vkc_pin.datasets.recipe import load_recipe
 from vkc_pin.planning.planner import plan
 from vkc_pin.world.scene.scene import load_scene
@@ -15,30 +15,29 @@ from vkc_pin.world.task.steps import Actuate
 DOCUMENT = load_recipe(SMALL).document
 
 
-def test_packed_episode_is_read_back() -> None:
-    """Unpacking restores the plan, and its trajectory to 1e-9."""
+def test_episode_has_the_plan_and_its_trajectory_to_1e_9() -> None:
     found = plan(load_scene("drawer"), [Actuate("drawer", {"slide": 0.2})])
-    data, record = pack(7, {"robot": "husky_ur5e", "task": "drive-open"}, found)
-    episode = unpack(data)
-    restored, original = episode.trajectory, found.trajectory
+    episode = make_episode(7, {"robot": "husky_ur5e", "task": "drive-open"}, found)
+    rounded, original = episode.trajectory, found.trajectory
     times = np.linspace(original.times[0], original.times[-1], 500)
-    assert np.abs(restored.at(times) - original.at(times)).max() <= 1e-9
-    assert np.array_equal(restored.times, original.times)
-    assert restored.phases == original.phases
+    assert np.abs(rounded.at(times) - original.at(times)).max() <= 1e-9
+    assert np.array_equal(rounded.times, original.times)
+    assert rounded.phases == original.phases
     assert episode.steps == found.steps
     assert episode.options == found.options
     report = episode.validate()
     assert report.ok
     assert report.contradictions(episode.claimed) == []
-    assert record["scene"] == compute_scene_name(episode.document)
-    assert len(data) <= 40_000
 
 
 def test_attempts_are_determined_by_their_number() -> None:
-    record, data = run_attempt(DOCUMENT, 0, {})
-    second_record, second_data = run_attempt(DOCUMENT, 0, {})
+    record, episode = run_attempt(DOCUMENT, 0, {})
+    second_record, second = run_attempt(DOCUMENT, 0, {})
     assert record["success"]
-    assert data == second_data
+    assert episode is not None
+    assert second is not None
+    assert record["scene"] == compute_scene_name(episode.document)
+    assert episode.trajectory.to_dict() == second.trajectory.to_dict()
     measured = {name for name in record if name.endswith(("_time", "_mb"))} | {"seconds"}
     assert record.keys() == second_record.keys()
     for name in record.keys() - measured:
@@ -47,8 +46,8 @@ def test_attempts_are_determined_by_their_number() -> None:
 
 
 def test_failed_plan_has_a_reason() -> None:
-    record, data = run_attempt({**DOCUMENT, "max_evaluations": 1}, 0, {})
-    assert (record["success"], data) == (False, b"")
+    record, episode = run_attempt({**DOCUMENT, "max_evaluations": 1}, 0, {})
+    assert (record["success"], episode) == (False, None)
     assert record["status"] == "evaluation limit"
     assert record["reason"]
 

@@ -137,9 +137,9 @@ def test_command_reports_faults_and_reuses_coverage() -> None:
     for _ in range(2):
         process = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     *lines, summary = process.stdout.splitlines()
-    assert summary == "1 killed, 2 survived, 1 uncovered: 25% killed", process.stdout
+    assert summary == "2 killed, 1 survived, 1 uncovered: 50% killed", process.stdout
     assert process.returncode == 1
-    place = "experiments/harness/runner.py:124: constant: 12 → 13"
+    place = "experiments/harness/runner.py:123: constant: 12 → 13"
     assert [line for line in lines if "survived" in line and line.endswith(place)]
     assert lines[0].startswith("1 of 4, "), "the second run reuses the coverage"
 

@@ -109,11 +109,3 @@ def test_depth_of_floor_pixels_is_consistent(images: Images) -> None:
         assert floor.sum() >= least
         assert np.abs(heights[floor]).max() < 0.01
         assert heights[(segments > 0) & ~floor].min() > -0.01
-
-
-def test_images_round_trip_through_bytes(images: Images) -> None:
-    decoded = Images.from_bytes(images.to_bytes())
-    assert decoded.segments == images.segments
-    assert list(decoded.pictures) == list(images.pictures)
-    for name, pixels in images.pictures.items():
-        np.testing.assert_array_equal(decoded.pictures[name], pixels)

@@ -12,7 +12,7 @@ from helpers.expected_errors import expect_error
 from helpers.tasks import crash_once, double, hang, identify_worker
 
 from vkc_pin.utils.interrupt import start_without_interrupt
-from vkc_pin.utils.parallel import MAX_CRASHES, CrashedTask, require_dask, run_tasks
+from vkc_pin.utils.parallel import MAX_CRASHES, CrashedTask, check_processes, run_tasks
 
 
 def make_tasks(count: int) -> list[tuple[str, int]]:
@@ -21,6 +21,8 @@ def make_tasks(count: int) -> list[tuple[str, int]]:
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_tasks_run_once_in_any_number_of_processes(jobs: int) -> None:
+    if jobs > 1:
+        pytest.importorskip("distributed")
     found = list(run_tasks(double, make_tasks(20), jobs=jobs))
     assert sorted((int(key), value) for key, value in found) == [(k, 2 * k) for k in range(20)]
 
@@ -29,7 +31,7 @@ def test_tasks_run_once_in_any_number_of_processes(jobs: int) -> None:
 def test_crashes_neither_lose_nor_repeat_other_tasks(tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     tasks = [(str(k), (str(tmp_path), k)) for k in range(8)]
-    found = list(run_tasks(crash_once, tasks, jobs=2, dask=True))
+    found = list(run_tasks(crash_once, tasks, jobs=2))
     assert sorted((int(key), value) for key, value in found) == [(k, 2 * k) for k in range(8)]
     assert (tmp_path / "2").exists()
 
@@ -37,16 +39,16 @@ def test_crashes_neither_lose_nor_repeat_other_tasks(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_tasks_that_crash_every_process_are_given_up() -> None:
     pytest.importorskip("distributed")
-    found = dict(run_tasks(hang, make_tasks(4), jobs=2, dask=True, limit=1.0))
+    found = dict(run_tasks(hang, make_tasks(4), jobs=2, limit=1.0))
     assert isinstance(found["1"], CrashedTask)
     assert f"{MAX_CRASHES} processes died" in found["1"].reason
     assert [found[key] for key in ("0", "2", "3")] == [0, 4, 6]
 
 
-@pytest.mark.parametrize("dask", [False, True])
-def test_tasks_are_consumed_on_demand(dask: bool) -> None:
-    """Earlier results determine the number of tasks; Dask's processes have one thread."""
-    if dask:
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_tasks_are_consumed_on_demand(jobs: int) -> None:
+    """Earlier results determine the number of tasks; other processes have one thread."""
+    if jobs > 1:
         pytest.importorskip("distributed")
     consumed, found = [], list[tuple[int, str]]()
 
@@ -57,10 +59,10 @@ def test_tasks_are_consumed_on_demand(dask: bool) -> None:
             consumed.append(k)
             yield str(k), k
 
-    for _, result in run_tasks(identify_worker, tasks(), jobs=2 if dask else 1, dask=dask):
+    for _, result in run_tasks(identify_worker, tasks(), jobs=jobs):
         found.append(result)
     assert 8 <= len(consumed) <= 8 + 4
-    if dask:
+    if jobs > 1:
         assert len({process for process, _ in found} - {os.getpid()}) == 2
         assert {threads for _, threads in found} == {"1"}
 
@@ -72,11 +74,18 @@ def test_missing_schedulers_raise(monkeypatch: pytest.MonkeyPatch) -> None:
         list(run_tasks(double, make_tasks(2), scheduler="tcp://127.0.0.1:9"))
 
 
+def test_several_processes_need_dask(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with expect_error("pip install .*distributed.*the extra `cluster`", field="jobs"):
+        list(run_tasks(double, make_tasks(2), jobs=2))
+    assert dict(run_tasks(double, make_tasks(2))) == {"0": 0, "1": 2}
+
+
 @pytest.mark.parametrize("address", ["here", "tcp://here", "tcp://:8786", 3])
 def test_invalid_addresses_raise(address: Any) -> None:
     pytest.importorskip("distributed")
     with expect_error("not an address", field="scheduler"):
-        require_dask(address)
+        check_processes(1, address)
 
 
 def test_schedulers_without_workers_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -111,7 +120,7 @@ def interrupt():
 if __name__ == "__main__":
     threading.Thread(target=interrupt, daemon=True).start()
     try:
-        for _ in run_tasks(time.sleep, ((str(k), 1.0) for k in range(600)), jobs=2, dask=True):
+        for _ in run_tasks(time.sleep, ((str(k), 1.0) for k in range(600)), jobs=2):
             print("a result", flush=True)
     except KeyboardInterrupt:
         print("interrupted", flush=True)

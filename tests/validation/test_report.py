@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers.expected_errors import expect_error
 
 import vkc_pin as vkc
 from vkc_pin import InputError, Report, Violation, validate
@@ -91,18 +92,32 @@ def test_round_trip() -> None:
     assert vars(only) == {**vars(FULL), "violations": (LIMIT,)}
 
 
-def test_missing_fields_have_defaults() -> None:
+def test_fields_that_older_files_lack_have_defaults() -> None:
     data = FULL.to_dict()
-    for name in ("clearances", "states", "torque", "bounds", "remarks", "closure_angle"):
+    for name in ("clearances", "torque", "bounds", "remarks", "allowed"):
         del data[name]
     found = Report.from_dict({**data, "clearance": 1, "closure_error": np.float64(0.5)})
     assert found == Report(
         FULL.violations,
         1.0,
         closure_error=0.5,
+        closure_angle=FULL.closure_angle,
+        states=FULL.states,
         notes=FULL.notes,
         exemptions=FULL.exemptions,
     )
+    for name in ("violations", "clearance", "closure_error", "closure_angle", "states", "notes"):
+        with expect_error(field=name):
+            Report.from_dict({key: value for key, value in data.items() if key != name})
+
+
+def test_null_is_an_infinite_distance() -> None:
+    """JSON without infinite numbers, as in datasets, has null instead."""
+    data = FULL.to_dict()
+    data["violations"][0]["amount"] = None
+    found = Report.from_dict({**data, "clearance": None, "clearances": [0.3, None]})
+    assert (found.clearance, found.clearances) == (math.inf, (0.3, math.inf))
+    assert found.violations[0].amount == math.inf
 
 
 @pytest.mark.parametrize(
@@ -111,10 +126,10 @@ def test_missing_fields_have_defaults() -> None:
         (("violations",), 3, "violations"),
         (("violations", 0), 3, "violations[0]"),
         (("violations", 0, "time"), "soon", "violations[0].time"),
-        (("violations", 0, "amount"), None, "violations[0].amount"),
+        (("violations", 0, "amount"), math.nan, "violations[0].amount"),
         (("violations", 1, "subject"), 3, "violations[1].subject"),
         (("violations", 1, "waypoint"), -1, "violations[1].waypoint"),
-        (("violations", 1, "more"), 1, "violations[1]"),
+        (("violations", 1, "more"), 1, "violations[1].more"),
         (("notes",), 3, "notes"),
         (("notes", 0), 3, "notes[0]"),
         (("remarks", 0), 3, "remarks[0]"),
@@ -126,13 +141,13 @@ def test_missing_fields_have_defaults() -> None:
         (("bounds", 0, "share"), "half", "bounds[0].share"),
         (("bounds", 1, "end"), math.inf, "bounds[1].end"),
         (("bounds", 0, "kind"), None, "bounds[0].kind"),
-        (("bounds", 0, "more"), 1, "bounds[0]"),
+        (("bounds", 0, "more"), 1, "bounds[0].more"),
         (("exemptions", 0, "distance"), "far", "exemptions[0].distance"),
-        (("exemptions", 0, "more"), 1, "exemptions[0]"),
-        (("more",), 1.5, None),
+        (("exemptions", 0, "more"), 1, "exemptions[0].more"),
+        (("more",), 1.5, "more"),
     ],
 )
-def test_invalid_data_raise(path: tuple[str | int, ...], value: object, field: str | None) -> None:
+def test_invalid_data_raise(path: tuple[str | int, ...], value: object, field: str) -> None:
     data: Any = json.loads(json.dumps(FULL.to_dict()))
     place = data
     for key in path[:-1]:

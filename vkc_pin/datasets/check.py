@@ -29,7 +29,7 @@ from vkc_pin.simulation.cameras import Images, render_images
 from vkc_pin.simulation.execution import simulate
 from vkc_pin.utils.arguments import check_integer, is_number
 from vkc_pin.utils.arrays import Bools, Ints
-from vkc_pin.utils.parallel import CrashedTask, is_dask_installed, run_tasks
+from vkc_pin.utils.parallel import CrashedTask, run_tasks
 from vkc_pin.validation.validate import validate
 from vkc_pin.world.files.writing import check_inside, check_writable, write_atomically
 
@@ -135,7 +135,7 @@ def check_dataset(
     )
     found: dict[int, tuple[list[dict[str, Any]], list[str]]] = {}
     with tqdm(total=len(shards), unit="shard", disable=not progress) as bar:
-        for key, result in run_tasks(check_shard, tasks, jobs=jobs, dask=is_dask_installed()):
+        for key, result in run_tasks(check_shard, tasks, jobs=jobs):
             found[int(key)] = (
                 ([], [f"{shards[int(key)]}: {result.reason}"])
                 if isinstance(result, CrashedTask)
@@ -374,7 +374,7 @@ def _check_lerobot_folders(dataset: Dataset, jobs: int) -> Iterator[str]:
     for name in sorted(set(dataset.robots) - names):
         yield f"lerobot/{name}: missing"
     tasks = ((name, (str(dataset.folder), name)) for name in dataset.robots if name in names)
-    found = dict(run_tasks(check_lerobot, tasks, jobs=jobs, dask=is_dask_installed()))
+    found = dict(run_tasks(check_lerobot, tasks, jobs=jobs))
     for name in sorted(found):
         result = found[name]
         yield from [result.reason] if isinstance(result, CrashedTask) else result

@@ -19,7 +19,7 @@ from vkc_pin.datasets.formats.hdf5 import read_episodes, read_numbers, read_scen
 from vkc_pin.datasets.recipe import Recipe, load_recipe
 from vkc_pin.errors import InputError
 from vkc_pin.world.files.documents import Document, parse_document, read_text
-from vkc_pin.world.files.fields import make_validation_error
+from vkc_pin.world.files.fields import Count, Finite, Measured, Text, make_validation_error
 from vkc_pin.world.files.resources import check_path
 from vkc_pin.world.files.writing import check_name, write_atomically
 
@@ -38,39 +38,34 @@ _COLUMNS = (
     *("clearance", "waypoints", "scene", "seconds", "planning_time"),
 )
 
-_Text = Annotated[str, Field(strict=True)]
-_Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
-_Measured = Annotated[float, Field(strict=True, ge=0.0, allow_inf_nan=False)]
-_Count = Annotated[int, Field(strict=True, ge=0)]
-
 
 class _AttemptSchema(BaseModel):
     """The record of an attempt: the fields that are used; there are others for statistics."""
 
-    number: _Count
+    number: Count
     success: Annotated[bool, Field(strict=True)]
-    status: _Text
-    reason: _Text = ""
-    task: _Text | None = None
-    robot: _Text | None = None
-    room: _Text | None = None
-    object: _Text | None = None
-    kind: _Text | None = None
-    attachment: _Text | None = None
-    joint: _Text | None = None
-    goal: _Finite | list[_Finite] | None = None
-    variant: _Count | None = None
-    scene: _Text | None = None
-    start: list[_Finite] | None = None
-    way: list[list[_Finite]] | None = None
-    waypoints: _Count | None = None
-    duration: _Measured | None = None
-    base_path_length: _Measured | None = None
-    arm_path_length: _Measured | None = None
-    clearance: _Finite | None = None
-    seconds: _Measured | None = None
-    planning_time: _Measured | None = None
-    cpu_time: _Measured | None = None
+    status: Text
+    reason: Text = ""
+    task: Text | None = None
+    robot: Text | None = None
+    room: Text | None = None
+    object: Text | None = None
+    kind: Text | None = None
+    attachment: Text | None = None
+    joint: Text | None = None
+    goal: Finite | list[Finite] | None = None
+    variant: Count | None = None
+    scene: Text | None = None
+    start: list[Finite] | None = None
+    way: list[list[Finite]] | None = None
+    waypoints: Count | None = None
+    duration: Measured | None = None
+    base_path_length: Measured | None = None
+    arm_path_length: Measured | None = None
+    clearance: Finite | None = None
+    seconds: Measured | None = None
+    planning_time: Measured | None = None
+    cpu_time: Measured | None = None
 
     @model_validator(mode="after")
     def _check_success(self) -> Self:

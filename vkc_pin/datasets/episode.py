@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import io
 import json
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vkc_pin.datasets.diversity import sample_coarse_trajectory
-from vkc_pin.datasets.problems import NoProblemError, sample_problem
+from vkc_pin.datasets.problems import NoProblemError, Problem, sample_problem
 from vkc_pin.datasets.recipe import Recipe, load_recipe
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
@@ -25,15 +24,16 @@ from vkc_pin.planning.planner import Planner, plan
 from vkc_pin.simulation.cameras import Images, render_images
 from vkc_pin.simulation.execution import simulate
 from vkc_pin.simulation.result import SimulationResult
-from vkc_pin.utils.arrays import Floats, replace_infinite
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.system import identify_process, measure_peak_memory, measure_resident_memory
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
 from vkc_pin.world.files.resources import find_resource_folder
 from vkc_pin.world.files.writing import check_name
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.steps import Step, step_from_dict, step_to_dict
-from vkc_pin.world.task.terms import Term, term_from_dict, term_to_dict
+from vkc_pin.world.task.steps import Step
+from vkc_pin.world.task.terms import Term
+from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.trajectory import MOST_SAMPLES, Trajectory
 
 _PLANNER = {"entries": 512, "megabytes": 96.0}
@@ -112,73 +112,69 @@ def _load_recipe(recipe: str) -> Recipe:
     return load_recipe(json.loads(recipe))
 
 
-Made = tuple[dict[str, Any], bytes]
-"""The record of an attempt, as in the journal, and the packed episode, empty after a failure."""
+Attempt = tuple[dict[str, Any], Episode | None]
+"""The record of an attempt, as in the journal, and its episode, None after a failure."""
 
 
-def run_attempts(task: tuple[Mapping[str, Any], Sequence[int], Mapping[str, str]]) -> list[Made]:
-    """Run attempts with a recipe's document, their numbers, and files of robots.
+def run_attempt(document: Mapping[str, Any], number: int, robots: Mapping[str, str]) -> Attempt:
+    """Plan one episode; exceptions become recorded failures.
 
-    See `run_attempt`.
+    Args:
+        document: Document of the recipe.
+        number: Number of the attempt.
+        robots: Name → file of the recipe's robots.
     """
-    recipe, numbers, robots = task
-    return [run_attempt(recipe, number, robots) for number in numbers]
-
-
-def run_attempt(document: Mapping[str, Any], number: int, robots: Mapping[str, str]) -> Made:
-    """Plan one episode; exceptions become recorded failures."""
-    start_time, start_cpu_time = time.perf_counter(), time.process_time()
+    start_time = time.perf_counter()
+    start_cpu_time = time.process_time()
     record: dict[str, Any] = {"number": number, "success": False}
-    data = images = b""
+    episode = None
     try:
         recipe = _load_recipe(json.dumps(document, sort_keys=True))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # warnings about a robot would repeat in every episode
             problem = sample_problem(recipe, number, robots, _get_planner())
             record |= {**problem.about, "setup_time": round(time.perf_counter() - start_time, 4)}
-            plan_result = plan(
-                problem.scene,
-                problem.steps,
-                options=problem.options,
-                seed=problem.seed,
-                max_evaluations=recipe.fields.max_evaluations,
-                time_limit=recipe.fields.time_limit,
-                perturbation=0.0 if problem.seed == 0 else _PERTURBATION,
-                terms=problem.terms,
-                planner=_get_planner(),
-            )
-            record |= _record_plan(plan_result)
-            if plan_result.success and recipe.fields.simulate:
-                executed = simulate(plan_result.scene, plan_result.steps, plan_result.trajectory)
+            planned = _plan_problem(problem, recipe)
+            record |= _record_plan(planned)
+            images = None
+            if planned.success and recipe.fields.simulate:
+                executed = simulate(planned.scene, planned.steps, planned.trajectory)
                 record |= _record_simulation(executed)
                 if executed.ok and recipe.cameras:
-                    images = render_images(
-                        executed,
-                        recipe.cameras,
-                        sample_times(plan_result.trajectory, recipe.fields.rate),
-                    ).to_bytes()
+                    times = sample_times(planned.trajectory, recipe.fields.rate)
+                    images = render_images(executed, recipe.cameras, times)
             if record["success"]:
-                about = problem.about | {"metrics": _select_metrics(plan_result)}
-                data, more = pack(number, about, plan_result, images)
-                record |= more
+                about = {**problem.about, "metrics": _select_metrics(planned)}
+                made = make_episode(number, about, planned, images)
+                record |= _record_motion(made, planned)
+                episode = made
     except NoProblemError as error:
         record |= {"status": "no problem", "reason": str(error)}
     except Exception as error:  # one episode must not end ten thousand
-        record |= {
-            "success": False,
-            "status": "error",
-            "reason": f"{type(error).__name__}: {error}",
-        }
+        reason = f"{type(error).__name__}: {error}"
+        record |= {"success": False, "status": "error", "reason": reason}
     record |= {
         "seconds": round(time.perf_counter() - start_time, 4),
         "cpu_time": round(time.process_time() - start_cpu_time, 4),
-    }
-    record |= {
         "memory_mb": round(measure_peak_memory(), 1),
         "resident_mb": round(measure_resident_memory(), 1),
         "process": identify_process(),
     }
-    return record, data if record["success"] else b""
+    return record, episode
+
+
+def _plan_problem(problem: Problem, recipe: Recipe) -> Plan:
+    return plan(
+        problem.scene,
+        problem.steps,
+        options=problem.options,
+        seed=problem.seed,
+        max_evaluations=recipe.fields.max_evaluations,
+        time_limit=recipe.fields.time_limit,
+        perturbation=0.0 if problem.seed == 0 else _PERTURBATION,
+        terms=problem.terms,
+        planner=_get_planner(),
+    )
 
 
 _PERTURBATION = 0.05  # [m], [rad] noise of initial guesses of further variants
@@ -252,124 +248,61 @@ def compute_scene_name(document: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()[:_DIGITS]
 
 
-def pack(
-    number: int, about: Mapping[str, Any], plan_result: Plan, images: bytes = b""
-) -> tuple[bytes, dict[str, Any]]:
-    """Return a plan as bytes for `unpack`, and additional fields of its journal record.
+def make_episode(
+    number: int, about: Mapping[str, Any], planned: Plan, images: Images | None = None
+) -> Episode:
+    """Return the episode of a plan, with its trajectory rounded to multiples of `_GRID`.
 
     Args:
         number: Episode number.
         about: See `Episode`.
-        plan_result: The plan.
-        images: Camera images as bytes (`Images.to_bytes`), if any.
+        planned: The plan.
+        images: Camera images, if any.
     """
-    document = json.loads(json.dumps(plan_result.scene.document))
+    document = json.loads(json.dumps(planned.scene.document))
     start = document.pop("start")
     document["robot"]["name"] = about["robot"]
-    motion = plan_result.trajectory.to_dict()
-    arrays = {name: _round_to_grid(motion.pop(name)) for name in ("positions",)} | {
-        "times": np.array(motion.pop("times"), float)
-    }
-    for name, values in motion.pop("curve", {}).items():
-        arrays[f"knot_{name}"] = (
-            np.array(values, float) if name == "times" else _round_to_grid(values)
-        )
-    outside = plan_result.scene.folder.resolve() != find_resource_folder("scenes").resolve()
-    data = {
-        "number": number,
-        "about": dict(about),
-        "scene": document,
-        "start": start,
-        "where": str(plan_result.scene.folder.resolve()) if outside else None,
-        "steps": [step_to_dict(step) for step in plan_result.steps],
-        "terms": [term_to_dict(term) for term in plan_result.terms],
-        "options": asdict(plan_result.options),
-        "motion": motion,
-        "validation": replace_infinite(plan_result.report.to_dict()),
-    }
-    buffer = io.BytesIO()
-    seen: Any = {"images": np.frombuffer(images, np.uint8)} if images else {}
-    np.savez_compressed(
-        buffer, allow_pickle=False, about=np.array(json.dumps(data)), **arrays, **seen
+    folder = planned.scene.folder.resolve()
+    is_packaged = folder == find_resource_folder("scenes").resolve()
+    return Episode(
+        number=number,
+        about=json.loads(json.dumps(about)),
+        document=document,
+        start=start,
+        where=None if is_packaged else str(folder),
+        steps=planned.steps,
+        options=planned.options,
+        trajectory=_round_trajectory(planned.trajectory),
+        claimed=planned.report,
+        terms=planned.terms,
+        load_images=None if images is None else lambda: images,
     )
-    more = {
-        "scene": compute_scene_name(document),
-        "start": np.asarray(plan_result.scene.start).round(4).tolist(),
-        "end": plan_result.trajectory.positions[-1][:2].round(4).tolist(),
-        "waypoints": len(plan_result.trajectory.times),
-        **{
-            name: round(value, 5)
-            for name, value in _select_metrics(plan_result).items()
-            if name != "evaluations"
-        },
-        "way": sample_coarse_trajectory(plan_result.trajectory),
+
+
+def _record_motion(episode: Episode, planned: Plan) -> dict[str, Any]:
+    """Return the fields of an attempt's record that describe its motion."""
+    metrics = _select_metrics(planned)
+    del metrics["evaluations"]
+    return {
+        "scene": compute_scene_name(episode.document),
+        "start": np.asarray(planned.scene.start).round(4).tolist(),
+        "end": planned.trajectory.positions[-1][:2].round(4).tolist(),
+        "waypoints": len(planned.trajectory.times),
+        **{name: round(value, 5) for name, value in metrics.items()},
+        "way": sample_coarse_trajectory(planned.trajectory),
     }
-    return buffer.getvalue(), more
+
+
+def _round_trajectory(motion: Trajectory) -> Trajectory:
+    curve = motion.curve
+    if curve is not None:
+        curve = Curve(curve.times, _round_to_grid(curve.positions), _round_to_grid(curve.rates))
+    return replace(motion, positions=_round_to_grid(motion.positions), curve=curve)
 
 
 def _round_to_grid(values: Any) -> Floats:
     """Return numbers rounded to multiples of `_GRID`."""
     return np.round(np.array(values, float) / _GRID) * _GRID
-
-
-def unpack(data: bytes, robots: Path | None = None) -> Episode:
-    """Return the episode from bytes of `pack`; `robots` is the folder of the dataset's robots."""
-    with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-        arrays = {name: archive[name] for name in archive.files}
-    about, seen = json.loads(str(arrays.pop("about"))), arrays.pop("images", None)
-    plan_result = make_episode(
-        about, {name: np.asarray(values, float) for name, values in arrays.items()}, robots
-    )
-    return (
-        plan_result
-        if seen is None
-        else replace(plan_result, load_images=functools.partial(Images.from_bytes, seen.tobytes()))
-    )
-
-
-def make_episode(
-    data: Mapping[str, Any], arrays: Mapping[str, Floats], robots: Path | None = None
-) -> Episode:
-    """Return an episode from its description and its arrays; see `pack`.
-
-    Raises:
-        InputError: Fields are missing or invalid.
-    """
-    try:
-        motion = {**data["motion"], "times": arrays["times"], "positions": arrays["positions"]}
-        if "knot_times" in arrays:
-            motion["curve"] = {
-                name: arrays[f"knot_{name}"] for name in ("times", "positions", "rates")
-            }
-        report = dict(data["validation"])
-        report["clearance"] = np.inf if report["clearance"] is None else report["clearance"]
-        report["clearances"] = [
-            np.inf if value is None else value for value in report["clearances"]
-        ]
-        return Episode(
-            number=int(data["number"]),
-            about=data["about"],
-            document=data["scene"],
-            start=data["start"],
-            where=data["where"],
-            steps=tuple(step_from_dict(step) for step in data["steps"]),
-            options=Options(**data["options"]),
-            trajectory=Trajectory.from_dict(motion),
-            claimed=Report.from_dict(report),
-            terms=tuple(term_from_dict(term) for term in data.get("terms", ())),
-            robots=robots,
-        )
-    except InputError:
-        raise
-    except (
-        *(LookupError, TypeError, AttributeError, ValueError),
-        *(OverflowError, RecursionError, MemoryError),
-    ) as error:
-        raise InputError(
-            "the data are not an episode",
-            expected="an episode written by `generate`",
-            got=f"{type(error).__name__}: {error}",
-        ) from error
 
 
 def get_work_file(out: Path, number: int) -> Path:

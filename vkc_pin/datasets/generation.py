@@ -23,10 +23,10 @@ from vkc_pin.datasets.dataset import (
     has_intact_scene,
     read_intact_numbers,
 )
-from vkc_pin.datasets.episode import Made, get_work_file
+from vkc_pin.datasets.episode import get_work_file
 from vkc_pin.datasets.formats import lerobot as lerobot_layout
 from vkc_pin.datasets.formats.card import make_card
-from vkc_pin.datasets.formats.hdf5 import make_parts
+from vkc_pin.datasets.formats.hdf5 import Made, make_parts
 from vkc_pin.datasets.formats.hdf5_reader import require_h5py
 from vkc_pin.datasets.recipe import CAMERAS, Recipe, load_recipe, make_entries
 from vkc_pin.datasets.robots import check_frames, prepare_robots
@@ -34,7 +34,7 @@ from vkc_pin.errors import InputError, VkcError
 from vkc_pin.simulation.physics import import_mujoco
 from vkc_pin.utils.arguments import check_bool, check_integer
 from vkc_pin.utils.journal import Journal
-from vkc_pin.utils.parallel import CrashedTask, require_dask, run_tasks
+from vkc_pin.utils.parallel import CrashedTask, check_processes, run_tasks
 from vkc_pin.utils.system import find_versions, identify_process
 from vkc_pin.world.files.resources import check_path
 from vkc_pin.world.files.writing import (
@@ -109,8 +109,7 @@ def generate(  # noqa: PLR0913 - keyword options of a public call
     lerobot = check_bool(lerobot, "lerobot") or (folder / "lerobot").is_dir()
     if lerobot:
         lerobot_layout.require_pyarrow(loaded.fields.rate)
-    if jobs > 1 or scheduler is not None:
-        require_dask(scheduler)
+    check_processes(jobs, scheduler)
     with _open_journal(folder, loaded) as journal:
         remove_leftovers(folder)
         if (folder / "lerobot").is_dir():
@@ -233,7 +232,6 @@ def _run_attempts(
         _iterate_tasks(dataset, register, journal, clock, retried, robots),
         jobs=jobs,
         scheduler=scheduler,
-        dask=True,
         limit=_WATCHDOG * size * fields.time_limit,
         tell=(lambda line: tqdm.write(line, file=sys.stderr)) if progress else None,
     )

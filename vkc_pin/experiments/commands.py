@@ -17,6 +17,7 @@ from vkc_pin.utils.command_line import (
     report_interruption,
 )
 from vkc_pin.utils.interrupt import raise_on_interrupt
+from vkc_pin.utils.parallel import is_dask_installed
 
 
 def add_bench(commands: Any) -> None:
@@ -41,7 +42,7 @@ def _add_door(benches: Any) -> None:
 
 def _add_comparisons(benches: Any) -> None:
     about = "compare initialization methods at a task with a tool"
-    jobs = os.cpu_count() or 1
+    jobs = (os.cpu_count() or 1) if is_dask_installed() else 1
     module = "vkc_pin.experiments.initialization"
     parser = add_experiment(benches, "initialization", about, module=module, jobs=jobs)
     add_count(parser, "--starts", 50, "random starts per scene")

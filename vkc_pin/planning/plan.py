@@ -5,16 +5,17 @@ from __future__ import annotations
 import json
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
-from vkc_pin.utils.arguments import check_bool, check_choice, check_number
-from vkc_pin.utils.arrays import Floats, replace_infinite
+from vkc_pin.utils.arguments import check_bool, check_number
+from vkc_pin.utils.arrays import replace_infinite
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import check_arguments, validate
+from vkc_pin.world.files.documents import Document, parse_document
 from vkc_pin.world.files.resources import check_path
 from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.world.scene.scene import Scene
@@ -38,8 +39,20 @@ if TYPE_CHECKING:
     import meshcat
     import pinocchio as pin
 
+    from vkc_pin.planning.plan_schema import PlanSchema
     from vkc_pin.simulation.result import SimulationResult
 
+
+PlanStatus = Literal[
+    "success",
+    "infeasible",
+    "not converged",
+    "time limit",
+    "evaluation limit",
+    "interrupted",
+    "rejected",
+]
+"""How planning ended. Other planners have words of their own, see `Plan.status`."""
 
 STAGES = ("initialization", "coal", "casadi", "ipopt", "retiming", "validation")
 """Stages of planning whose times are measured."""
@@ -245,6 +258,8 @@ class Plan:
 
     def to_dict(self) -> dict[str, Any]:
         """Return trajectory, metrics and report as plain data; infinite numbers are None."""
+        report = self.report.to_dict()
+        shown = ("violations", "notes", "bounds", "remarks", "exemptions", "allowed")
         data = {
             "scene": self.scene.name,
             "steps": [step_to_dict(step) for step in self.steps],
@@ -254,12 +269,7 @@ class Plan:
             "seed": self.seed,
             "initialization": self.initialization,
             "is_optimized": self.is_optimized,
-            "violations": [asdict(violation) for violation in self.report.violations],
-            "notes": list(self.report.notes),
-            "bounds": [asdict(bound) for bound in self.report.bounds],
-            "remarks": list(self.report.remarks),
-            "exemptions": [asdict(exemption) for exemption in self.report.exemptions],
-            "allowed": list(self.report.allowed),
+            **{name: list(report[name]) for name in shown},
         }
         return {**replace_infinite(data), "trajectory": self.trajectory.to_dict()}
 
@@ -358,10 +368,12 @@ class Plan:
             InputError: The file is missing, damaged, inconsistent or of another format, or the
                 scene has no such robot, object or file.
         """
+        from vkc_pin.planning.plan_schema import PlanSchema  # takes 10 ms
+
         path = check_path(path, "path", "a saved plan (.npz)")
-        about, arrays = read_archive(path)
+        saved = parse_document(Document(read_archive(path), path), PlanSchema)
         try:
-            plan = cls._from_archive(about, arrays, path)
+            plan = cls._from_schema(saved, path)
             check_arguments(plan.scene, plan.steps, plan.trajectory, plan.terms)
             return _revalidate(plan) if check_bool(validate, "validate") else plan
         except InputError as error:
@@ -386,11 +398,10 @@ class Plan:
             ) from error
 
     @classmethod
-    def _from_archive(
-        cls, about: Mapping[str, Any], arrays: Mapping[str, Floats], path: Path
-    ) -> Plan:
-        trajectory = Trajectory.from_dict({**about["trajectory"], **arrays})
-        claimed, metrics = Report.from_dict(about["validation"]), about["metrics"]
+    def _from_schema(cls, saved: PlanSchema, path: Path) -> Plan:
+        trajectory = saved.trajectory.make_trajectory()
+        claimed = saved.validation
+        metrics = saved.metrics.model_dump()
         for name, value in {**trajectory.metrics(), **claimed.measures()}.items():
             got, tolerance = metrics[name], 1e-9 * max(1.0, abs(value))
             if got != value and not abs(got - value) <= tolerance:
@@ -400,22 +411,19 @@ class Plan:
             problem, expected = "wrong number", f"{len(trajectory.phases)}, one per phase"
             got = len(claimed.clearances)
             raise InputError(problem, field="validation.clearances", expected=expected, got=got)
-        options = [item.name for item in fields(Options)]
-        for name in about["options"]:
-            check_choice(name, options, "option", f"options.{name}")
         return cls(
-            scene=Scene.from_document(about["scene"], resolve_folder(about["folder"], path)),
-            steps=tuple(step_from_dict(step) for step in about["steps"]),
-            options=_parse_options(about["options"]),
+            scene=Scene.from_document(saved.scene, resolve_folder(saved.folder, path)),
+            steps=tuple(step_from_dict(step) for step in saved.steps),
+            options=Options.from_dict(saved.options),
             trajectory=trajectory,
             report=claimed,
-            status=about["status"],
+            status=saved.status,
             statistics=PlanningStatistics.from_metrics(metrics),
-            seed=about["seed"],
-            initialization=about["initialization"],
-            is_optimized=about["is_optimized"],
-            history=tuple(about["history"]),
-            terms=tuple(term_from_dict(term) for term in about["terms"]),
+            seed=saved.seed,
+            initialization=saved.initialization,
+            is_optimized=saved.is_optimized,
+            history=tuple(saved.history),
+            terms=tuple(term_from_dict(term) for term in saved.terms),
             claimed=claimed,
             is_validated=False,
         )
@@ -435,12 +443,6 @@ def _revalidate(plan: Plan) -> Plan:
 
 def _measure(plan: Plan) -> dict[str, float]:
     return {**plan.trajectory.metrics(), **plan.report.measures()}
-
-
-def _parse_options(options: Mapping[str, Any]) -> Options:
-    """Return saved options; those without `self_distance` used `dist_safe` for all pairs."""
-    default = {"self_distance": options["dist_safe"]} if "dist_safe" in options else {}
-    return Options(**{**default, **options})
 
 
 _WIDTH = 100  # of a summary's lines, in columns: what a notebook shows without a break

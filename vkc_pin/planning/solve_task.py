@@ -28,7 +28,7 @@ from vkc_pin.planning.initialization.initial_guess import (
 from vkc_pin.planning.initialization.methods import initialize
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.plan import STAGES, Plan, PlanningStatistics
+from vkc_pin.planning.plan import STAGES, Plan, PlanningStatistics, PlanStatus
 from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.results import (
     CURVELESS,
@@ -54,7 +54,6 @@ from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.clearance_exemptions import ACCEPTED_SHORTFALL
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Task
-from vkc_pin.world.trajectory.formats.archives import PlanStatus
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 _CHECK_TIME = 2e-3

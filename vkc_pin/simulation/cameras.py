@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -120,22 +118,6 @@ class Images:
 
     pictures: Mapping[str, NDArray[np.generic]]
     segments: tuple[str, ...]
-
-    def to_bytes(self) -> bytes:
-        """Return the images as compressed bytes that `from_bytes` reads."""
-        buffer = io.BytesIO()
-        names: Any = np.array(json.dumps([list(self.pictures), self.segments]))
-        pictures: Any = {f"picture_{k}": pixels for k, pixels in enumerate(self.pictures.values())}
-        np.savez_compressed(buffer, allow_pickle=False, names=names, **pictures)
-        return buffer.getvalue()
-
-    @classmethod
-    def from_bytes(cls, data: bytes) -> Images:
-        """Return the images that `to_bytes` encoded."""
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            names, segments = json.loads(str(archive["names"]))
-            pictures = {name: archive[f"picture_{k}"] for k, name in enumerate(names)}
-            return cls(pictures, tuple(segments))
 
 
 def render_images(executed: Execution, cameras: Sequence[Camera], times: Floats) -> Images:

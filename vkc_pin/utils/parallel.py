@@ -1,4 +1,4 @@
-"""Runs a function on many tasks: in this process, in others of this machine, or on a cluster.
+"""Runs a function on many tasks: in this process, or by Dask in others, here or on a cluster.
 
 Only the calling process writes files. The tasks of a lost process are run again.
 """
@@ -17,14 +17,15 @@ import time
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
+from importlib.util import find_spec
 from typing import Any
 
-from vkc_pin.errors import InputError, VkcError, format_value
+from vkc_pin.errors import InputError, format_value
 from vkc_pin.utils.interrupt import start_without_interrupt
 from vkc_pin.utils.optional_imports import import_optional
 
 MAX_CRASHES = 4
-"""Number of processes that a task may crash on a cluster before it is given up."""
+"""Number of processes that a task may crash before it is given up."""
 _ADDRESS = re.compile(r"[a-z]+://[^/\s]+:\d{1,5}")
 _QUEUED_PER_WORKER = 2  # so that no worker waits for a task
 _CONNECT_TIMEOUT = 20.0  # [s]
@@ -42,12 +43,14 @@ class CrashedTask:
     reason: str
 
 
-def require_dask(scheduler: str | None) -> None:
-    """Check that Dask is installed, and the address of its scheduler, if one is given.
+def check_processes(jobs: int, scheduler: str | None) -> None:
+    """Check that Dask is installed if it is needed, and the address of its scheduler.
 
     Raises:
         InputError: Dask is not installed, or the address is invalid.
     """
+    if scheduler is None and jobs == 1:
+        return
     field = "jobs" if scheduler is None else "scheduler"
     if scheduler is not None and not (isinstance(scheduler, str) and _ADDRESS.fullmatch(scheduler)):
         expected, got = "such as tcp://HOST:8786", format_value(scheduler)
@@ -57,11 +60,7 @@ def require_dask(scheduler: str | None) -> None:
 
 def is_dask_installed() -> bool:
     """Return whether Dask is installed (the extra `cluster`)."""
-    try:
-        import distributed  # noqa: F401
-    except ImportError:
-        return False
-    return True
+    return find_spec("distributed") is not None
 
 
 def run_tasks(
@@ -70,7 +69,6 @@ def run_tasks(
     *,
     jobs: int = 1,
     scheduler: str | None = None,
-    dask: bool = False,
     limit: float | None = None,
     tell: Callable[[str], object] | None = None,
 ) -> Results:
@@ -83,52 +81,23 @@ def run_tasks(
     Args:
         function: Function of a task.
         tasks: Key and task, each.
-        jobs: Number of processes on this machine, each with one BLAS thread; 1: this process.
+        jobs: Number of processes on this machine, each with one BLAS thread, which are restarted
+            when they crash; 1: this process.
         scheduler: Address of a Dask scheduler ("tcp://host:8786") whose workers run the tasks.
-        dask: Use Dask for processes on this machine, which restarts them when they crash. Without
-            it, a crash ends the run.
         limit: Wall-clock time of a task [s] after which its process is killed; not in this process.
         tell: Receives messages for users, such as the address of Dask's dashboard.
 
     Yields:
-        Key and result; a `CrashedTask` if the task crashed `MAX_CRASHES` processes of Dask.
+        Key and result; a `CrashedTask` if the task crashed `MAX_CRASHES` processes.
 
     Raises:
         InputError: Dask is needed and not installed, or no scheduler answers.
-        VkcError: A process crashed, without Dask.
     """
-    if scheduler is not None or (dask and jobs > 1):
+    if scheduler is not None or jobs > 1:
         yield from _run_on_cluster(function, tasks, jobs, scheduler, limit, tell)
-    elif jobs > 1:
-        yield from _run_in_processes(function, tasks, jobs, limit)
     else:
         for key, task in tasks:
             yield key, function(task)
-
-
-def _run_in_processes(
-    function: Function, tasks: Iterable[tuple[str, Any]], jobs: int, limit: float | None
-) -> Results:
-    from joblib import Parallel, delayed, parallel_config
-    from joblib.externals.loky.process_executor import BrokenProcessPool
-
-    # a stop would lose whole batches, so they have one task each
-    with parallel_config(backend="loky", n_jobs=jobs, inner_max_num_threads=1):
-        parallel = Parallel(return_as="generator_unordered", batch_size=1, max_nbytes=None)
-        found = parallel(
-            delayed(_run_in_child_process)(function, key, task, limit, os.getpid())
-            for key, task in tasks
-        )
-    try:
-        yield from found
-    except BrokenProcessPool as error:
-        raise VkcError(
-            "a process died, perhaps for want of memory; the trials that were done are kept, and "
-            f"the same call goes on ({str(error).splitlines()[0]})"
-        ) from error
-    finally:
-        with contextlib.suppress(KeyboardInterrupt):
-            found.close()  # ends running tasks
 
 
 def _run_on_cluster(
@@ -139,7 +108,7 @@ def _run_on_cluster(
     limit: float | None,
     tell: Callable[[str], object] | None,
 ) -> Results:
-    require_dask(scheduler)
+    check_processes(jobs, scheduler)
     with _open_client(jobs, scheduler) as (client, cluster), client.as_current():
         if tell is not None:
             tell(f"Dask's dashboard: {client.dashboard_link}")
@@ -280,14 +249,6 @@ def run_with_time_limit(function: Function, task: Any, limit: float | None) -> A
         return function(task)
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
-
-
-def _run_in_child_process(
-    function: Function, key: str, task: Any, limit: float | None, parent: int
-) -> tuple[str, Any]:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
-    exit_with_parent(parent)
-    return key, run_with_time_limit(function, task, limit)
 
 
 @cache

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Protocol, runtime_checkable
 
-from vkc_pin.errors import InputError
-from vkc_pin.utils.arguments import (
-    check_integer,
-    check_list,
-    check_mapping,
-    check_number,
-    check_text,
-)
+from pydantic.types import FailFast
+
+from vkc_pin.utils.arguments import check_mapping
+from vkc_pin.world.files.documents import Document, parse_document
+from vkc_pin.world.files.fields import Count, Distance, Finite, Measured, StoredRecord, Text
 
 if TYPE_CHECKING:
     from vkc_pin.options import Options
@@ -22,13 +19,12 @@ if TYPE_CHECKING:
 
 
 AGREEMENT_TOLERANCE = 1e-5  # accepted difference of two checks of one motion [m] or [rad]
-_Check = Callable[[Any, str], Any]  # checks the value of a field
 MAX_BOUNDS = 4  # limiting constraints listed in the text
 MAX_VIOLATIONS = 12  # violations listed in the text; `violations` has all of them
 
 
 @dataclass(frozen=True)
-class Violation:
+class Violation(StoredRecord):
     """A violated constraint.
 
     Attributes:
@@ -46,14 +42,15 @@ class Violation:
         detail: Description in one sentence.
     """
 
-    constraint: str
-    subject: str
+    required_fields: ClassVar = ("waypoint", "time")
+    constraint: Text
+    subject: Text
     _: KW_ONLY
-    waypoint: int = 0
-    time: float = 0.0
-    amount: float
-    unit: str
-    detail: str
+    waypoint: Count = 0
+    time: Finite = 0.0
+    amount: Distance  # infinite for a user constraint that overflows
+    unit: Text
+    detail: Text
 
     @property
     def text(self) -> str:
@@ -65,7 +62,7 @@ class Violation:
 
 
 @dataclass(frozen=True)
-class Bound:
+class Bound(StoredRecord):
     """A limit that bounds the speed of a motion.
 
     Attributes:
@@ -77,12 +74,12 @@ class Bound:
         end: End of that interval [s].
     """
 
-    subject: str
-    kind: str
+    subject: Text
+    kind: Text
     _: KW_ONLY
-    share: float
-    begin: float
-    end: float
+    share: Measured
+    begin: Finite
+    end: Finite
 
     def __str__(self) -> str:
         limit = f"{self.subject} {self.kind}" if self.subject else "pauses"
@@ -90,7 +87,7 @@ class Bound:
 
 
 @dataclass(frozen=True)
-class Exemption:
+class Exemption(StoredRecord):
     """A pair of links that violated the clearance, or overlapped, but was exempt from it.
 
     Attributes:
@@ -99,9 +96,9 @@ class Exemption:
         reason: Reason for the exemption.
     """
 
-    subject: str
-    distance: float
-    reason: str
+    subject: Text
+    distance: Finite
+    reason: Text
 
     def __str__(self) -> str:
         by = 1e3 * abs(self.distance)
@@ -110,7 +107,7 @@ class Exemption:
 
 
 @dataclass(frozen=True)
-class Report:
+class Report(StoredRecord):
     """The result of validating a motion.
 
     Attributes:
@@ -133,19 +130,28 @@ class Report:
             a step or an option allows it; one line each.
     """
 
-    violations: tuple[Violation, ...] = ()
-    clearance: float = float("inf")
+    # Older files lack the others.
+    required_fields: ClassVar = (
+        "violations",
+        "clearance",
+        "closure_error",
+        "closure_angle",
+        "states",
+        "notes",
+    )
+    violations: Annotated[tuple[Violation, ...], FailFast()] = ()
+    clearance: Distance = float("inf")
     _: KW_ONLY
-    closure_error: float = 0.0
-    closure_angle: float = 0.0
-    clearances: tuple[float, ...] = ()
-    states: int = 0
-    notes: tuple[str, ...] = ()
-    torque: float = 0.0
-    bounds: tuple[Bound, ...] = ()
-    remarks: tuple[str, ...] = ()
-    exemptions: tuple[Exemption, ...] = ()
-    allowed: tuple[str, ...] = ()
+    closure_error: Measured = 0.0
+    closure_angle: Measured = 0.0
+    clearances: Annotated[tuple[Distance, ...], FailFast()] = ()
+    states: Count = 0
+    notes: Annotated[tuple[Text, ...], FailFast()] = ()
+    torque: Measured = 0.0
+    bounds: Annotated[tuple[Bound, ...], FailFast()] = ()
+    remarks: Annotated[tuple[Text, ...], FailFast()] = ()
+    exemptions: Annotated[tuple[Exemption, ...], FailFast()] = ()
+    allowed: Annotated[tuple[Text, ...], FailFast()] = ()
 
     @property
     def ok(self) -> bool:
@@ -223,78 +229,9 @@ class Report:
         """Return the report described by data from `to_dict`.
 
         Raises:
-            InputError: A field is missing or has the wrong type.
+            InputError: A field is missing, unknown, or has the wrong type.
         """
-        fields = dict(check_mapping(data, "report"))
-        for name in ("clearance", "closure_error", "closure_angle"):
-            if name in fields:
-                fields[name] = _check_real(fields[name], name)
-        fields["states"] = check_integer(fields.get("states", 0), "states", low=0)
-        fields["torque"] = check_number(fields.get("torque", 0.0), "torque", low=0.0)
-        for name, (check, default, expected) in _LISTS.items():
-            values: Any = check_list(fields.get(name, default), name, expected)
-            fields[name] = tuple(check(one, f"{name}[{k}]") for k, one in enumerate(values))
-        try:
-            return cls(**fields)
-        except TypeError as error:  # an unknown field
-            raise InputError(
-                "not a report", expected="what Report.to_dict returns", got=str(error)
-            ) from None
-
-
-def _check_real(value: Any, field: str) -> float:
-    """Return a number, possibly infinite. Raises `InputError` for anything else."""
-    return value if isinstance(value, float) else check_number(value, field)
-
-
-def _parse(made: type[Any], data: Any, field: str, checks: Mapping[str, _Check]) -> Any:
-    """Return an entry of a report. Raises `InputError` for missing, wrong and unknown fields."""
-    given = check_mapping(data, field)
-    for name, check in checks.items():
-        given[name] = check(given.get(name), f"{field}.{name}")
-    try:
-        return made(**given)
-    except TypeError as error:
-        problem, expected = f"invalid {made.__name__}", "what Report.to_dict returns"
-        raise InputError(problem, field=field, expected=expected, got=str(error)) from None
-
-
-def _parse_violation(data: Any, field: str) -> Violation:
-    names = ("constraint", "subject", "unit", "detail")
-    checks: dict[str, _Check] = dict.fromkeys(names, check_text)
-    checks |= {"time": _check_real, "amount": _check_real, "waypoint": _check_waypoint}
-    found: Violation = _parse(Violation, data, field, checks)
-    return found
-
-
-def _check_waypoint(value: Any, field: str) -> int:
-    return check_integer(value, field, low=0)
-
-
-def _parse_bound(data: Any, field: str) -> Bound:
-    checks: dict[str, _Check] = dict.fromkeys(("subject", "kind"), check_text)
-    checks |= dict.fromkeys(("share", "begin", "end"), check_number)
-    found: Bound = _parse(Bound, data, field, checks)
-    return found
-
-
-def _parse_exemption(data: Any, field: str) -> Exemption:
-    checks: dict[str, _Check] = {"subject": check_text, "reason": check_text}
-    checks["distance"] = check_number
-    found: Exemption = _parse(Exemption, data, field, checks)
-    return found
-
-
-_LISTS: dict[str, tuple[_Check, Any, str]] = {
-    "clearances": (_check_real, (), "a list of distances"),
-    "violations": (_parse_violation, None, "a list of violations"),
-    "notes": (check_text, None, "a list of texts"),
-    "bounds": (_parse_bound, (), "a list of bounds"),
-    "remarks": (check_text, (), "a list of texts"),
-    "exemptions": (_parse_exemption, (), "a list of exemptions"),
-    "allowed": (check_text, (), "a list of texts"),
-}
-"""Fields that are lists: check of an entry, default (None: the field is required), expectation."""
+        return parse_document(Document(dict(check_mapping(data, "report"))), cls)
 
 
 @runtime_checkable

@@ -8,7 +8,7 @@ import pinocchio as pin
 import pytest
 
 from vkc_pin.datasets.dataset import Dataset
-from vkc_pin.datasets.episode import run_attempt, unpack
+from vkc_pin.datasets.episode import run_attempt
 from vkc_pin.datasets.formats.hdf5 import (
     make_part,
     read_episodes,
@@ -48,9 +48,9 @@ def test_groups_have_the_robomimic_layout(dataset: Dataset) -> None:
 
 def test_episodes_are_read_back_to_1e_9(dataset: Dataset) -> None:
     for episode in read_episodes(dataset.shards[0], dataset.folder / "scenes"):
-        record, data = run_attempt(dataset.recipe.document, episode.number, {})
-        fresh = unpack(data)
+        record, fresh = run_attempt(dataset.recipe.document, episode.number, {})
         assert record["success"]
+        assert fresh is not None
         times = np.linspace(fresh.trajectory.times[0], fresh.trajectory.times[-1], 300)
         assert np.abs(episode.trajectory.at(times) - fresh.trajectory.at(times)).max() <= 1e-9
         assert episode.trajectory.phases == fresh.trajectory.phases

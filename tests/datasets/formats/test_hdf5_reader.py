@@ -76,8 +76,8 @@ DAMAGES: list[tuple[Change, str]] = [
     (set_description("terms", value=[{"term": "Cost"}]), "not a saved term"),
     (set_description("plot", value=1), "there is no field 'plot'"),
     (replace_member("motion", np.zeros(3)), "motion: wrong kind of member"),
-    (replace_member("motion", h5py.Group.create_group), "not an episode"),
-    (lambda demo: demo["motion"].pop("knot_rates"), "not an episode"),
+    (replace_member("motion", h5py.Group.create_group), "motion.times: missing"),
+    (lambda demo: demo["motion"].pop("knot_rates"), "motion.curve.rates: missing"),
     (replace_member(MOTION, create_array(10**9, **CHUNKS)), "knot_times: too large"),
     (
         replace_member(MOTION, create_array(10, maxshape=(None,), chunks=(10**8,))),

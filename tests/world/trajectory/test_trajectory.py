@@ -115,6 +115,24 @@ def test_invalid_fields_are_rejected(field: str, changes: dict[str, Any]) -> Non
 @pytest.mark.parametrize(
     ("wrong", "field"),
     [
+        ({"first": -1}, "first"),
+        ({"name": 3}, "name"),
+        ({"opening": -0.1}, "opening"),
+        ({"opening": "wide"}, "opening"),
+        ({"deviation": {"stick": [0.01, 0.0]}}, "deviation.stick"),
+        ({"more": 1}, "more"),
+    ],
+)
+def test_invalid_phases_in_data_are_rejected(wrong: dict[str, Any], field: str) -> None:
+    data = make_example_trajectory().to_dict()
+    data["phases"][1] |= wrong
+    with expect_error(field=f"phases[1].{field}"):
+        Trajectory.from_dict(data)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "field"),
+    [
         ({"first": -1}, "PhaseSpan.first"),
         ({"name": 3}, "PhaseSpan.name"),
         ({"opening": -0.1}, "PhaseSpan.opening"),
@@ -123,11 +141,13 @@ def test_invalid_fields_are_rejected(field: str, changes: dict[str, Any]) -> Non
 )
 def test_invalid_phases_are_rejected(wrong: dict[str, Any], field: str) -> None:
     with expect_error(field=field):
-        PhaseSpan.from_dict({**PhaseSpan("go", 0, 4).to_dict(), **wrong}, "phases[0]")
+        PhaseSpan(**{"name": "go", "first": 0, "last": 4, **wrong})
 
 
 def test_missing_fields_of_phases_are_named() -> None:
-    with expect_error("held: this is missing from a trajectory"):
-        PhaseSpan.from_dict({"name": "go", "first": 0, "last": 1}, "phases[0]")
-    with expect_error(r"phases\[3\]"):
-        PhaseSpan.from_dict("go", "phases[3]")
+    data = make_example_trajectory().to_dict()
+    del data["phases"][0]["held"]
+    with expect_error(r"phases\[0\]\.held: missing"):
+        Trajectory.from_dict(data)
+    with expect_error(field="phases[1]"):
+        Trajectory.from_dict({**data, "phases": [data["phases"][1], "go"]})

@@ -22,27 +22,22 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from vkc_pin.datasets.episode import (
-    Episode,
-    Made,
-    compute_scene_name,
-    make_episode,
-    run_attempts,
-    unpack,
-)
+from vkc_pin.datasets.episode import Episode, compute_scene_name, run_attempt
 from vkc_pin.datasets.formats.hdf5_reader import Group, open_hdf5, require_h5py
 from vkc_pin.datasets.formats.samples import sample_episode
 from vkc_pin.datasets.recipe import Recipe, load_recipe
 from vkc_pin.errors import InputError, format_value
+from vkc_pin.options import Options
 from vkc_pin.simulation.cameras import Images
 from vkc_pin.utils.arrays import Floats, Ints, replace_infinite
+from vkc_pin.validation.report import Report
 from vkc_pin.world.files.documents import Document, parse_document, parse_json, read_text
 from vkc_pin.world.files.fields import Name, Schema
 from vkc_pin.world.files.writing import check_name, write_atomically
 from vkc_pin.world.models.robot import Robot
-from vkc_pin.world.task.steps import step_to_dict
-from vkc_pin.world.task.terms import term_to_dict
-from vkc_pin.world.trajectory.formats.archives import MotionSchema, ReportSchema
+from vkc_pin.world.task.steps import step_from_dict, step_to_dict
+from vkc_pin.world.task.terms import term_from_dict, term_to_dict
+from vkc_pin.world.trajectory.trajectory import TrajectorySchema
 
 if TYPE_CHECKING:
     import h5py
@@ -68,6 +63,8 @@ _MOTION = {
 _IMAGES = {"_image": ("u1", 4), "_depth": ("u2", 3), "_segmentation": ("u2", 3)}
 _MAX_IMAGES = 4_000_000_000  # [bytes] of a camera in an episode
 _TOLERANCE = 1e-5  # of single precision, and of other machines; relative, and [m] or [rad]
+Made = tuple[dict[str, Any], bytes]
+"""The record of an attempt, and its episode as packed by `make_part`, empty after a failure."""
 _ROBOTS: dict[tuple[str, str, float | None], Robot] = {}
 """Robots of this process by recipe, name and height, since building every scene is slow."""
 
@@ -223,15 +220,18 @@ def _array(group: h5py.Group, name: str, values: Any, kind: Any) -> None:
     group.create_dataset(name, data=values, chunks=values.shape if squeezed else None, **squeezed)
 
 
-class _EpisodeSchema(Schema):
-    """The attribute `episode`; scenes, steps and terms check their own parts."""
+class EpisodeSchema(Schema):
+    """The attribute `episode` with the arrays of its motion.
+
+    Scenes, steps and terms check their own parts.
+    """
 
     about: dict[str, Any]
     start: dict[str, Any]
     where: str | None
     steps: list[dict[str, Any]]
-    motion: MotionSchema
-    validation: ReportSchema
+    motion: TrajectorySchema
+    validation: Report
     terms: list[dict[str, Any]] = Field(default_factory=list)
     images: list[Name] | None = None
     segments: list[str] = Field(default_factory=list)
@@ -274,15 +274,27 @@ class Shard:
         name = _read_scene_name(demo)
         if name not in self._documents:
             self._documents[name] = read_scene(self._scenes, name)
-        with Document(None, self.file).annotate_errors((f"demo_{k}",)):
-            options = parse_json(self._data.read_text("options"), self.file)
-            said = _read_description(demo)
-            data = {**said, "options": options, "scene": self._documents[name]}
-            data["number"] = demo.read_integer("number")
-            episode = make_episode(data, _read_motion(demo), self._scenes.parent / "robots")
-        if said["images"] is None:
-            return episode
-        return replace(episode, load_images=functools.partial(_read_images, self.file, k))
+        options = parse_json(self._data.read_text("options"), self.file)
+        stored = _read_description(demo)
+        number = demo.read_integer("number")
+        load_images = None
+        if stored.images is not None:
+            load_images = functools.partial(_read_images, self.file, k)
+        with Document(None, self.file).annotate_errors((f"demo_{k}",)), _expect_episode():
+            return Episode(
+                number=number,
+                about=stored.about,
+                document=self._documents[name],
+                start=stored.start,
+                where=stored.where,
+                steps=tuple(step_from_dict(step) for step in stored.steps),
+                options=Options.from_dict(options),
+                trajectory=stored.motion.make_trajectory(),
+                claimed=stored.validation,
+                terms=tuple(term_from_dict(term) for term in stored.terms),
+                robots=self._scenes.parent / "robots",
+                load_images=load_images,
+            )
 
     def find_differences(self, k: int, episode: Episode, robot: Robot, rate: float) -> list[str]:
         """Return what a learner reads of an episode that does not follow from its motion.
@@ -306,7 +318,7 @@ class Shard:
                 row = np.argwhere(wrong)[0].tolist()
                 at = tuple(row)
                 found.append(f"{name}{row} is {stored[at]:.6g}, not {values[at]:.6g} as its motion")
-        _check_images(demo, _read_description(demo)["images"] or [], count)
+        _check_images(demo, _read_description(demo).images or [], count)
         claims = {"num_samples": demo.read_integer("num_samples"), "task": demo.read_text("task")}
         truth = {"num_samples": count, "task": episode.about.get("task")}
         return found + _compare(claims, truth)
@@ -351,6 +363,24 @@ def _compare(claims: Mapping[str, Any], truth: Mapping[str, Any]) -> list[str]:
         for name, value in truth.items()
         if claims[name] != value
     ]
+
+
+@contextlib.contextmanager
+def _expect_episode() -> Iterator[None]:
+    """Convert exceptions of steps, terms and options that are none into an `InputError`."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (
+        *(LookupError, TypeError, AttributeError, ValueError),
+        *(OverflowError, RecursionError, MemoryError),
+    ) as error:
+        raise InputError(
+            "the data are not an episode",
+            expected="an episode written by `generate`",
+            got=f"{type(error).__name__}: {error}",
+        ) from error
 
 
 @contextlib.contextmanager
@@ -420,10 +450,12 @@ def _read_scene_name(demo: Group) -> str:
     return check_name(demo.read_attribute("scene"), f"{place}: scene", file=demo.file)
 
 
-def _read_description(demo: Group) -> dict[str, Any]:
+def _read_description(demo: Group) -> EpisodeSchema:
     data = parse_json(demo.read_text("episode"), demo.file)
+    if isinstance(data, dict) and isinstance(data.get("motion"), dict):
+        data["motion"] |= _read_motion(demo)
     try:
-        return parse_document(Document(data), _EpisodeSchema).model_dump()
+        return parse_document(Document(data), EpisodeSchema)
     except InputError as error:
         where = f"{demo.name.rpartition('/')[2]}: {error.field or 'episode'}"
         raise InputError(
@@ -431,37 +463,44 @@ def _read_description(demo: Group) -> dict[str, Any]:
         ) from error
 
 
-def _read_motion(demo: Group) -> dict[str, Floats]:
-    """Return the arrays of a motion as `make_episode` expects them."""
-    motion = demo.open_group("motion")
-    found = {
-        name: motion.read_array(name, dtype, (None,) * axes)
+def _read_motion(demo: Group) -> dict[str, Any]:
+    """Return the arrays of a motion, as `TrajectorySchema` has them."""
+    group = demo.open_group("motion")
+    arrays = {
+        name: group.read_array(name, dtype, (None,) * axes)
         for name, (dtype, axes) in _MOTION.items()
-        if name in motion.list_names()
+        if name in group.list_names()
     }
-    at = found.pop("waypoints", None)
-    if at is None:
-        return found
-    for name in ("times", "positions"):
-        knots = found.get(f"knot_{name}")
-        if knots is None:
-            raise motion.make_error("missing", f"knot_{name}", expected="an array")
-        if at.min(initial=0) < 0 or at.max(initial=0) >= len(knots):
-            expected = f"indices from 0 to {len(knots) - 1}"
-            raise motion.make_error("out of range", "waypoints", expected=expected)
-        found[name] = knots[at]
-    return found
+    at = arrays.pop("waypoints", None)
+    if at is not None:
+        for name in ("times", "positions"):
+            knots = arrays.get(f"knot_{name}")
+            if knots is None:
+                raise group.make_error("missing", f"knot_{name}", expected="an array")
+            if at.min(initial=0) < 0 or at.max(initial=0) >= len(knots):
+                expected = f"indices from 0 to {len(knots) - 1}"
+                raise group.make_error("out of range", "waypoints", expected=expected)
+            arrays[name] = knots[at]
+    motion, curve = dict[str, Any](), dict[str, Any]()
+    for name, values in arrays.items():
+        if name.startswith("knot_"):
+            curve[name.removeprefix("knot_")] = values
+        else:
+            motion[name] = values
+    if curve:
+        motion["curve"] = curve
+    return motion
 
 
 def _read_images(path: Path, k: int) -> Images:
     """Read the camera images of an episode."""
     with open_hdf5(path) as root:
         demo = root.open_group("data").open_group(f"demo_{k}")
-        said = _read_description(demo)
-        names = said["images"] or []
+        stored = _read_description(demo)
+        names = stored.images or []
         _check_images(demo, names, demo.read_integer("num_samples"))
         arrays = {name: demo.open_group("obs").handle[name][:] for name in names}
-        return Images(arrays, tuple(said["segments"]))
+        return Images(arrays, tuple(stored.segments))
 
 
 def read_scene(scenes: Path, name: str) -> Any:
@@ -483,17 +522,26 @@ def _check_scene(document: Any, name: str, file: Path) -> Any:
 
 
 def make_parts(task: tuple[Mapping[str, Any], Sequence[int], Mapping[str, str]]) -> list[Made]:
-    """Make episodes as `run_attempts` does, packed by `make_part`, whose time is added."""
-    document, _, robots = task
-    recipe, found = load_recipe(document), []
+    """Run attempts, and pack their episodes by `make_part`, whose time is added.
+
+    Args:
+        task: Document of a recipe, numbers of attempts, and files of the robots; see `run_attempt`.
+    """
+    document, numbers, robots = task
+    recipe = load_recipe(document)
+    found = list[Made]()
     folder = next((Path(file).parent.parent for file in robots.values()), None)
-    for record, data in run_attempts(task):
-        if data:
-            began, worked = time.perf_counter(), time.process_time()
-            episode = unpack(data, folder)
+    for number in numbers:
+        record, made = run_attempt(document, number, robots)
+        data = b""
+        if made is not None:
+            start_time = time.perf_counter()
+            start_cpu_time = time.process_time()
+            episode = replace(made, robots=folder)
             robot = _load_robot(recipe.digest, episode)
             data = make_part(episode, robot, recipe.fields.rate, recipe.digest)
-            seconds, cpu_time = time.perf_counter() - began, time.process_time() - worked
+            seconds = time.perf_counter() - start_time
+            cpu_time = time.process_time() - start_cpu_time
             record["seconds"] = round(record["seconds"] + seconds, 4)
             record["cpu_time"] = round(record["cpu_time"] + cpu_time, 4)
         found.append((record, data))

@@ -20,7 +20,7 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.experiments.harness.record import describe_environment
 from vkc_pin.experiments.harness.tables import to_csv
 from vkc_pin.utils.journal import Journal
-from vkc_pin.utils.parallel import CrashedTask, require_dask, run_tasks
+from vkc_pin.utils.parallel import CrashedTask, check_processes, run_tasks
 from vkc_pin.utils.system import measure_peak_memory
 from vkc_pin.world.files.resources import find_package_folder, find_resource_folder
 from vkc_pin.world.files.writing import check_links, check_writable, write_atomically
@@ -52,7 +52,8 @@ class Execution(TypedDict, total=False):
     """How `run` executes trials.
 
     Attributes:
-        jobs: Number of processes, each with one thread of BLAS. Default: this process alone.
+        jobs: Number of processes, each with one thread of BLAS; more than 1 need the extra
+            `cluster`. Default: this process alone.
         scheduler: Address of a Dask scheduler whose workers run the trials instead; see
             `parallel.run_tasks`.
         progress: Whether to show a progress bar. Default: True.
@@ -98,12 +99,10 @@ def run(
     Raises:
         InputError: `out` has trials of other settings, versions or machines, has other files but no
             trials, is no folder, or is used by another run.
-        VkcError: A process died.
         KeyboardInterrupt: Ctrl-C was pressed; the message counts the finished trials.
     """
     check_positive(jobs=jobs)
-    if scheduler is not None:
-        require_dask(scheduler)
+    check_processes(jobs, scheduler)
     todo = {str(trial["key"]): dict(trial) for trial in trials}
     if len(todo) < len(trials):
         raise InputError("two trials have the same key", field="trials")

@@ -8,9 +8,11 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Set
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
+import numpy as np
 import pydantic
 import yaml
 
@@ -24,11 +26,12 @@ MAX_DEPTH = 50
 """Most lists and fields inside each other."""
 
 Key = str | int
-T = TypeVar("T", bound=pydantic.BaseModel)
+T = TypeVar("T")
 
 _EXPECTED = {
     "bool_parsing": "true or false",
     "bool_type": "true or false",
+    "dataclass_type": "fields (name: value)",
     "int_type": "a whole number",
     "dict_type": "fields (name: value)",
     "finite_number": "a finite number",
@@ -40,6 +43,7 @@ _EXPECTED = {
     "string_type": "text",
     "tuple_type": "a list",
 }
+_NUMBERS = (float, int)
 _SIGNS = {
     "greater_than": ">",
     "greater_than_equal": ">=",
@@ -241,15 +245,21 @@ def read_yaml(file: str | Path) -> Document:
 
 
 def parse_document(document: Document, schema: type[T]) -> T:
-    """Return `document` as an instance of `schema`."""
+    """Return `document` as an instance of `schema`, a pydantic model or a `StoredRecord`."""
     _check_plain(document)
+    adapter: pydantic.TypeAdapter[T] = _make_adapter(schema)  # type: ignore[arg-type] # hashable
     try:
-        return schema.model_validate(document.data)
+        return adapter.validate_python(document.data)
     except pydantic.ValidationError as problem:
         errors = problem.errors(include_url=False)
     located = [(_find_error_path(document.data, error), error) for error in errors]
     path, first = min(located, key=lambda item: document.find_line(item[0]) or 0)
     raise _translate_error(document, path, first)
+
+
+@cache
+def _make_adapter(schema: Any) -> pydantic.TypeAdapter[Any]:
+    return pydantic.TypeAdapter(schema)
 
 
 def _check_plain(document: Document) -> None:
@@ -268,7 +278,12 @@ def _check_plain(document: Document) -> None:
                 for name, entry in value.items()
             ]
         elif isinstance(value, list | tuple):
-            left += [((*path, place), entry) for place, entry in enumerate(value)]
+            # Motions have lists of 100 000 numbers.
+            left += [
+                ((*path, place), entry)
+                for place, entry in enumerate(value)
+                if not isinstance(entry, _NUMBERS)
+            ]
         elif isinstance(value, str):
             try:
                 value.encode("utf-8")
@@ -277,7 +292,7 @@ def _check_plain(document: Document) -> None:
                     path, "not text", expected="text in UTF-8", got=ascii(value)
                 ) from None
         elif isinstance(value, Iterable) and not isinstance(
-            value, Mapping | Set | bytes | bytearray
+            value, Mapping | Set | bytes | bytearray | np.ndarray
         ):
             raise document.make_error(
                 path,
@@ -359,7 +374,7 @@ def _find_error_path(data: Any, error: Any) -> tuple[Key, ...]:
             data = data[key]
         elif position == len(location) - 1 and error["type"] == "missing":
             path.append(key)
-    if error["type"] == "unknown_field":
+    if error["type"] in ("unknown_field", "missing_field"):
         path.append(error["ctx"]["name"])
     elif error["type"] in ("union_tag_invalid", "union_tag_not_found"):
         path.append(error["ctx"]["discriminator"].strip("'"))
@@ -370,7 +385,7 @@ def _translate_error(document: Document, path: tuple[Key, ...], error: Any) -> I
     kind, context, got = error["type"], error.get("ctx", {}), error["input"]
     if kind == "unknown_field":
         return document.make_unknown_name_error(path, "field", context["name"], context["choices"])
-    if kind in ("missing", "union_tag_not_found"):
+    if kind in ("missing", "missing_field", "union_tag_not_found"):
         tag = kind == "union_tag_not_found"
         return document.make_error(
             path, "missing", expected="the object's kind" if tag else "a value", got="nothing"

@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
-from collections.abc import Callable
-from typing import Annotated, Any
+from collections.abc import Callable, Collection
+from typing import Annotated, Any, ClassVar
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
-from pydantic_core import PydanticCustomError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError, core_schema
 
 from vkc_pin.utils.arrays import MAX_COORDINATE, MIN_POSITIVE
 
@@ -91,6 +100,50 @@ Quaternion = Annotated[
 ]
 """Unit quaternion [x, y, z, w]."""
 
+# Fields that this program writes, and that others do not write by hand.
+Text = Annotated[str, Field(strict=True)]
+Count = Annotated[int, Field(strict=True, ge=0)]
+Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Measured = Annotated[float, Field(strict=True, ge=0.0, allow_inf_nan=False)]
+_FROM_NULL = BeforeValidator(lambda value: math.inf if value is None else value)
+Distance = Annotated[float, Field(strict=True, gt=-math.inf), _FROM_NULL]
+"""Perhaps infinite, for which JSON without infinite numbers has null, but not NaN."""
+
+
+def _check_fields(data: Any, known: Collection[str], required: Collection[str] = ()) -> Any:
+    """Return data if all of its fields are known, and all required ones are there."""
+    if isinstance(data, dict):
+        for name in data:
+            if name not in known:
+                context = {"name": str(name), "choices": list(known)}
+                raise PydanticCustomError("unknown_field", "unknown field", context)
+        for name in required:
+            if name not in data:
+                raise PydanticCustomError("missing_field", "missing", {"name": name})
+    return data
+
+
+class StoredRecord:
+    """Base of dataclasses that are their own schema: the types of their fields check stored data.
+
+    Only `parse_document` checks them, a call of the class does not. Unknown fields are errors that
+    name the valid ones.
+    """
+
+    required_fields: ClassVar[tuple[str, ...]] = ()
+    """Fields that stored data must have, though calls may leave them out."""
+
+    @classmethod
+    def __get_pydantic_core_schema__(
+        cls, source: Any, handler: GetCoreSchemaHandler
+    ) -> core_schema.CoreSchema:
+        known = [item.name for item in dataclasses.fields(source)]
+
+        def check(data: Any) -> Any:
+            return _check_fields(data, known, cls.required_fields)
+
+        return core_schema.no_info_before_validator_function(check, handler(source))
+
 
 class Schema(BaseModel):
     """Base of all schemas: immutable, with errors for unknown fields that name the valid ones."""
@@ -99,13 +152,8 @@ class Schema(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _known_fields(cls, data: Any) -> Any:
-        if isinstance(data, dict):
-            for key in data:
-                if key not in cls.model_fields:
-                    context = {"name": str(key), "choices": list(cls.model_fields)}
-                    raise PydanticCustomError("unknown_field", "unknown field", context)
-        return data
+    def _check_fields(cls, data: Any) -> Any:
+        return _check_fields(data, cls.model_fields)
 
 
 class JointSchema(Schema):

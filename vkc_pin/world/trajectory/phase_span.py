@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
-from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.utils.arguments import check_integer, check_mapping, check_number, check_text
+from pydantic import Field
+
+from vkc_pin.utils.arguments import check_integer, check_number, check_text
+from vkc_pin.world.files.fields import Count, Finite, Measured, Schema, Text, require_length
 from vkc_pin.world.scene.hold import Hold, check_hold_order, make_holds
-
-_FIELDS = ("name", "first", "last", "held", "by", "deviation", "opening")
 
 
 @dataclass(frozen=True)
@@ -38,9 +37,8 @@ class PhaseSpan:
     def __post_init__(self) -> None:
         check_text(self.name, "PhaseSpan.name")
         for name in ("first", "last"):
-            object.__setattr__(
-                self, name, check_integer(getattr(self, name), f"PhaseSpan.{name}", low=0)
-            )
+            waypoint = check_integer(getattr(self, name), f"PhaseSpan.{name}", low=0)
+            object.__setattr__(self, name, waypoint)
         object.__setattr__(self, "holds", check_hold_order(self.holds))
         if self.opening is not None:
             field, expected = "PhaseSpan.opening", "a distance [m]"
@@ -53,52 +51,38 @@ class PhaseSpan:
         return {hold.object: hold.attachment for hold in self.holds}
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain data; `by` maps objects held through another to its "<object>.<link>".
-
-        `deviation` maps objects to that of their holds, if there is any.
-        """
-        by = {hold.object: hold.frame for hold in self.holds if hold.by}
+        """Return the phase as plain data, with the fields of `PhaseSchema`."""
         data = {
             "name": self.name,
             "first": self.first,
             "last": self.last,
             "held": self.held,
-            "by": by,
+            "by": {hold.object: hold.frame for hold in self.holds if hold.by},
         }
         deviation = {hold.object: list(hold.deviation) for hold in self.holds if hold.deviation}
-        more = {"deviation": deviation or None, "opening": self.opening}
-        return data | {name: value for name, value in more.items() if value is not None}
-
-    @classmethod
-    def from_dict(cls, data: Any, where: str) -> PhaseSpan:
-        """Return the phase described by data from `to_dict`, in the field `where`.
-
-        Raises:
-            InputError: A field is missing or invalid.
-        """
-        phase = check_fields(check_mapping(data, where), _FIELDS, where)
-        held = make_holds(
-            get_required_field(phase, "held", where),
-            phase.get("by"),
-            deviation=phase.get("deviation"),
-        )
-        name, first, last = (
-            get_required_field(phase, key, where) for key in ("name", "first", "last")
-        )
-        return cls(name, first, last, held, phase.get("opening"))
+        if deviation:
+            data["deviation"] = deviation
+        if self.opening is not None:
+            data["opening"] = self.opening
+        return data
 
 
-def check_fields(data: Mapping[str, Any], known: Collection[str], where: str) -> Mapping[str, Any]:
-    """Return data of a motion. Raises `UnknownNameError` if `where` has another field."""
-    for name in data:
-        if name not in known:
-            raise UnknownNameError("field", str(name), known, field=where or None)
-    return data
+class PhaseSchema(Schema):
+    """A phase in files, which state holds by the names of objects.
 
+    `by` maps objects held through another to its "<object>.<link>", `deviation` maps objects to
+    that of their holds.
+    """
 
-def get_required_field(data: Mapping[str, Any], name: str, where: str = "") -> Any:
-    """Return an entry of a motion's data. Raises `InputError` if it is missing."""
-    if name not in data:
-        field = ".".join(part for part in (where, name) if part)
-        raise InputError("this is missing from a trajectory", field=field)
-    return data[name]
+    name: Text
+    first: Count
+    last: Count
+    held: dict[str, Text]
+    by: dict[str, Text] = Field(default_factory=dict)
+    deviation: dict[str, Annotated[tuple[Finite, ...], require_length(6)]] | None = None
+    opening: Measured | None = None
+
+    def make_phase(self) -> PhaseSpan:
+        """Return the phase. Raises `InputError` if its holds do not fit together."""
+        holds = make_holds(self.held, self.by, deviation=self.deviation)
+        return PhaseSpan(self.name, self.first, self.last, holds, self.opening)

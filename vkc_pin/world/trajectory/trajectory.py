@@ -6,10 +6,11 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic.types import FailFast
 
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import (
@@ -18,16 +19,16 @@ from vkc_pin.utils.arguments import (
     check_instance,
     check_integer,
     check_list,
-    check_mapping,
     check_number,
     check_text,
 )
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.files.documents import Document, parse_document
+from vkc_pin.world.files.fields import Count, Schema, Text
 from vkc_pin.world.trajectory.curve import Curve, sample_evenly
 from vkc_pin.world.trajectory.formats import ros, rosbag, tables
-from vkc_pin.world.trajectory.phase_span import PhaseSpan, check_fields, get_required_field
+from vkc_pin.world.trajectory.phase_span import PhaseSchema, PhaseSpan
 
-_FIELDS = ("names", "times", "positions", "robot_size", "phases", "curve")
 MOST_SAMPLES = 1_000_000
 """Largest number of samples of a motion."""
 
@@ -276,20 +277,7 @@ class Trajectory:
         """
         if not isinstance(data, Mapping):
             raise InputError("not a trajectory", expected="an object", got=type(data).__name__)
-        check_fields(data, _FIELDS, "")
-        listed: tuple[Any, ...] = check_list(
-            get_required_field(data, "phases"), "phases", "a list of phases"
-        )
-        phases = [PhaseSpan.from_dict(item, f"phases[{k}]") for k, item in enumerate(listed)]
-        names, times, positions, size = (
-            get_required_field(data, key) for key in ("names", "times", "positions", "robot_size")
-        )
-        curve = data.get("curve")
-        if curve is not None:
-            parts = ("times", "positions", "rates")
-            knots = check_fields(check_mapping(curve, "curve"), parts, "curve")
-            curve = Curve(*(get_required_field(knots, key, "curve") for key in parts))
-        return cls(names, times, positions, tuple(phases), size, curve)
+        return parse_document(Document(dict(data)), TrajectorySchema).make_trajectory()
 
     def to_csv(self, path: str | Path, **options: Any) -> Path:
         """Write a CSV table of times, positions and phases; see `tables.write_csv`."""
@@ -357,3 +345,32 @@ class Trajectory:
             raise InputError(
                 error.problem, file=file, field=field, expected=error.expected, got=error.got
             ) from error
+
+
+class CurveSchema(Schema):
+    """A curve in files; `Curve` checks its arrays."""
+
+    times: Any
+    positions: Any
+    rates: Any
+
+
+class TrajectorySchema(Schema):
+    """A trajectory in files; `Trajectory` checks its arrays."""
+
+    names: Annotated[list[Text], FailFast()]
+    times: Any
+    positions: Any
+    robot_size: Count
+    phases: Annotated[list[PhaseSchema], FailFast()]
+    curve: CurveSchema | None = None
+
+    def make_trajectory(self) -> Trajectory:
+        """Return the trajectory. Raises `InputError` if its parts do not fit together."""
+        phases = tuple(phase.make_phase() for phase in self.phases)
+        curve = None
+        if self.curve is not None:
+            curve = Curve(self.curve.times, self.curve.positions, self.curve.rates)
+        return Trajectory(
+            tuple(self.names), self.times, self.positions, phases, self.robot_size, curve
+        )

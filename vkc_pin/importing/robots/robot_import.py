@@ -55,12 +55,11 @@ from vkc_pin.importing.targets import (
 from vkc_pin.importing.urdf_writing import add_connection
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import check_bool, check_integer, check_mapping, check_text
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.words import split_words
 from vkc_pin.world.files.resources import check_path, choose_file_names
+from vkc_pin.world.files.srdf import format_srdf
 from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.files.writing import write_folder_atomically
-from vkc_pin.world.files.xml import replace_forbidden
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.models.robot_model import build_full_model
@@ -509,25 +508,11 @@ class _Importer:
         self._settings["home"] = {
             joint: round(float(value), 6) for joint, value in zip(arm, home.positions, strict=True)
         }
-        self._write_srdf(self._folder / self._settings["srdf"], robot, home.positions, allowed)
+        positions = dict(zip(arm, map(float, home.positions), strict=True))
+        text = format_srdf(self._name, positions, dict(sorted(allowed.items())))
+        (self._folder / self._settings["srdf"]).write_text(text, encoding="utf-8")
         self._write()
         return home
-
-    def _write_srdf(
-        self, path: Path, robot: Robot, home: Floats, allowed: Mapping[tuple[str, str], str]
-    ) -> None:
-        root = ElementTree.Element("robot", name=replace_forbidden(self._name))
-        arm = ElementTree.SubElement(root, "group", name="arm")
-        state = ElementTree.SubElement(root, "group_state", name="home", group="arm")
-        for joint, value in zip(robot.coordinates.names[3:], home, strict=True):
-            ElementTree.SubElement(arm, "joint", name=joint)
-            ElementTree.SubElement(state, "joint", name=joint, value=f"{value:.9g}")
-        for (one, other), reason in sorted(allowed.items()):
-            ElementTree.SubElement(
-                root, "disable_collisions", link1=one, link2=other, reason=reason
-            )
-        ElementTree.indent(root)
-        ElementTree.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
 
     def _report(self, pieces: list[Piece], home: Home) -> None:
         values = ", ".join(f"{value:.2f}" for value in home.positions)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from vkc_pin.errors import InputError
-from vkc_pin.world.files.xml import find_line, read_xml
+from vkc_pin.world.files.xml import find_line, read_xml, replace_forbidden
 
 Pair = tuple[str, str]
 _HOMES = ("home", "default", "rest")  # names of states of rest, the preferred one first
@@ -136,6 +136,36 @@ def find_srdf(file: Path) -> Path | None:
             if candidate.is_file():
                 return candidate
     return None
+
+
+def format_srdf(
+    name: str,
+    home: Mapping[str, float],
+    allowed: Mapping[tuple[str, str], str],
+    comment: str = "",
+) -> str:
+    """Return an SRDF with a group `arm` and its state `home`.
+
+    Args:
+        name: Name of the robot.
+        home: Joint → position in the state, [m] or [rad].
+        allowed: Pair of links that may collide → reason.
+        comment: Text of a comment.
+    """
+    root = ElementTree.Element("robot", name=replace_forbidden(name))
+    group = ElementTree.SubElement(root, "group", name="arm")
+    state = ElementTree.SubElement(root, "group_state", name="home", group="arm")
+    for joint, position in home.items():
+        ElementTree.SubElement(group, "joint", name=joint)
+        ElementTree.SubElement(state, "joint", name=joint, value=f"{position:.12g}")
+    for (one, other), reason in allowed.items():
+        pair = {"link1": one, "link2": other, "reason": reason}
+        ElementTree.SubElement(root, "disable_collisions", pair)
+    ElementTree.indent(root)
+    head = ['<?xml version="1.0"?>']
+    if comment:
+        head.append(f"<!-- {comment} -->")
+    return "\n".join([*head, ElementTree.tostring(root, encoding="unicode")]) + "\n"
 
 
 def read_srdf(path: str | Path, urdf: ElementTree.Element) -> Srdf:

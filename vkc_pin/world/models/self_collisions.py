@@ -18,9 +18,8 @@ import pinocchio as pin
 
 from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.utils.disk_cache import load_or_build
-from vkc_pin.world.files.srdf import Srdf
+from vkc_pin.world.files.srdf import Srdf, format_srdf
 from vkc_pin.world.files.writing import write_atomically
-from vkc_pin.world.files.xml import quote
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_model import find_neighbours
 from vkc_pin.world.models.shapes import LinkDistances, ShapeDistances
@@ -414,28 +413,14 @@ def write_srdf(robot: Robot, path: str | Path, *, samples: int = _SAMPLES, seed:
     Returns:
         Path of the file.
     """
-    joints = robot.coordinates.names[3:]
-    lines = [
-        '<?xml version="1.0"?>',
-        f"<!-- Written by `vkc-pin srdf`: {samples} samples, seed {seed}. Adjacent: connected by",
-        "     a joint. Always: in collision in all samples. Never: in collision in no sample, nor",
-        "     after descents of the distance from the closest samples. -->",
-        f"<robot name={quote(robot.name)}>",
-    ]
-    lines.append('  <group name="arm">')
-    for name in joints:
-        lines.append(f"    <joint name={quote(name)}/>")
-    lines.append("  </group>")
-    lines.append('  <group_state name="home" group="arm">')
-    for name, position in zip(joints, robot.home, strict=True):
-        lines.append(f"    <joint name={quote(name)} value={quote(f'{position:.12g}')}/>")
-    lines.append("  </group_state>")
+    comment = (
+        f"Written by `vkc-pin srdf`: {samples} samples, seed {seed}. Adjacent: connected by\n"
+        "     a joint. Always: in collision in all samples. Never: in collision in no sample, nor\n"
+        "     after descents of the distance from the closest samples."
+    )
+    home = dict(zip(robot.coordinates.names[3:], robot.home.tolist(), strict=True))
     allowed = sample_allowed_pairs(robot, samples=samples, seed=seed)
-    for (one, other), reason in allowed.items():
-        links = f"link1={quote(one)} link2={quote(other)}"
-        lines.append(f"  <disable_collisions {links} reason={quote(reason)}/>")
-    lines.append("</robot>")
-    return write_atomically(path, ("\n".join(lines) + "\n").encode())
+    return write_atomically(path, format_srdf(robot.name, home, allowed, comment).encode())
 
 
 def _descend_to_collision(

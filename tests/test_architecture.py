@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import re
-import runpy
 import shutil
 import subprocess
 import sys
@@ -12,6 +11,8 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+
+from docs.pictures import architecture
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "vkc_pin"
@@ -144,5 +145,5 @@ def test_architecture_page_lists_every_package() -> None:
 
 
 def test_architecture_diagram_is_up_to_date() -> None:
-    drawn = runpy.run_path(str(ROOT / "docs" / "make_architecture.py"))["main"]()
+    drawn = architecture.draw()
     assert (ROOT / "docs" / "images" / "architecture.svg").read_text(encoding="utf-8") == drawn

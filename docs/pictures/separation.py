@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial import ConvexHull
 
 import vkc_pin as vkc
+from docs.pictures import IMAGES
 from vkc_pin.experiments.initialization import TARGET
 from vkc_pin.planning.initialization.methods import initialize
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
@@ -21,7 +21,7 @@ from vkc_pin.world.task.compiler import compile_task
 ROUNDS = (1, 3, 6)
 
 
-def main() -> int:
+def make() -> None:
     """Draw the path of the base in some rounds."""
     scene, options = vkc.load_scene("init_2"), vkc.Options()
     scene = scene.sample_start(np.random.default_rng(5))
@@ -49,9 +49,4 @@ def main() -> int:
             axes.plot(*path[:, :2].T, ".-", color=colour, label=name, linewidth=1.0, markersize=3.0)
         axes.legend(loc="best")
         axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
-        save_figure(figure, Path(__file__).parent / "images" / "separation.png")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        save_figure(figure, IMAGES / "separation.png")

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 import vkc_pin as vkc
+from docs.pictures import IMAGES
 from vkc_pin.experiments import chores
 from vkc_pin.planning.initialization import closed_trees, interpolation
 from vkc_pin.planning.initialization.keyframes import compute_shortfall
@@ -21,7 +21,7 @@ from vkc_pin.world.scene.obstacles import FLOOR
 EVERY = 6  # of the waypoints that are drawn
 
 
-def main() -> int:
+def make() -> None:
     """Draw a narrow door being closed: interpolated between keyframes, and by random trees."""
     scene = (
         chores.make_cluttered_home()
@@ -65,8 +65,7 @@ def main() -> int:
                 else "nothing overlaps"
             )
             axes.set_title(f"{title}: {overlap}")
-        save_figure(figure, Path(__file__).parent / "images" / "held.png")
-    return 0
+        save_figure(figure, IMAGES / "held.png")
 
 
 def draw_path(axes: Any, problem: TrajectoryProblem, path: np.ndarray, worst: int | None) -> None:
@@ -102,7 +101,3 @@ def draw_path(axes: Any, problem: TrajectoryProblem, path: np.ndarray, worst: in
                     linewidth=1.0 if k == worst else 0.6,
                 )
     axes.set(xlim=(0.9, 2.3), ylim=(0.45, 2.05), aspect="equal", xlabel="x [m]", ylabel="y [m]")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

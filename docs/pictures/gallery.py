@@ -1,13 +1,11 @@
 """Makes docs/images/gallery.png: robots from several sources that open objects from others.
 
-Usage: make_gallery.py [FOLDER]: where imported robots and plans are kept, and not made again
-(default: out/gallery). The pictures are drawn here, point by point, as they need no more than
-shades: dozens of them in a browser take long.
+Imported robots and plans are kept in out/gallery. The pictures are drawn here, point by point, as
+they need no more than shades: dozens of them in a browser take long.
 """
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,40 +14,31 @@ import pinocchio as pin
 from PIL import Image
 
 import vkc_pin as vkc
+from docs.pictures import IMAGES, ROOT
+from tests.benchmarks.robot_object_matrix.pairs import make_pair, parse_requests, prepare_robot
 from vkc_pin.experiments.harness.runner import LIMITS
 from vkc_pin.visualization.plots.style import new_figure, save_figure, use_style
 from vkc_pin.visualization.room import load_drawn_parts
 from vkc_pin.world.trajectory.world_model import World
 
-ROOT = Path(__file__).parent.parent
 ROBOTS = {"husky_ur5e": "Husky, UR5e", "tiago_pro": "TIAGo Pro", "pr2": "PR2", "panda": "Panda"}
 OBJECTS = {
     **{"door_0": "door", "drawers_0": "drawer", "refrigerator_0": "refrigerator"},
     **{"dishwasher_0": "dishwasher", "microwave_0": "microwave", "chest_0": "chest"},
 }
 STARTS = 5  # random ones: the first from which it is opened is shown
-SIDE, FINER, COLOURS = (
-    180,
-    2,
-    160,
-)  # [pixels] of a picture in the grid; in each of these so many; of the palette
+SIDE = 180  # [pixels] of a picture in the grid
+FINER = 2  # drawn pixels in each of these
 VIEW_DIRECTION = np.array([-0.85, -0.85, 0.62])  # from the target to the camera, not normalized
 FIELD = 0.62  # [m] half the width of the view at a distance of 1 m
 PIECE = 0.4  # [m] longest edge of a drawn triangle
 NEAR = 1.0  # [m] triangles closer to the camera are omitted
-DOTS, PARTS = (
-    (0.7, 1.5),
-    (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256),
-)  # [pixels] between points, also of shadows
+DOTS = (0.7, 1.5)  # [pixels] between points, and between those of shadows
+PARTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)  # of an edge of a triangle
 SUN = np.array([-0.35, -0.45, 0.82]) / np.linalg.norm([-0.35, -0.45, 0.82])
-FLOOR, SKY, SHADOW = np.array([0.90, 0.89, 0.87]), np.array([0.97, 0.97, 0.98]), 0.82
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from tests.benchmarks.robot_object_matrix.pairs import (  # noqa: E402
-    make_pair,
-    parse_requests,
-    prepare_robot,
-)
+FLOOR = np.array([0.90, 0.89, 0.87])
+SKY = np.array([0.97, 0.97, 0.98])
+SHADOW = 0.82
 
 
 def plan_opening(robot: str, file: str, object_name: str, folder: Path) -> vkc.Plan:
@@ -187,14 +176,14 @@ def draw_scene(scene: vkc.Scene) -> Image.Image:
     return picture.resize((SIDE, SIDE), Image.Resampling.LANCZOS)
 
 
-def main() -> int:
+def make() -> None:
     """Make it."""
-    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "out" / "gallery"
+    folder = ROOT / "out" / "gallery"
     ready = {
         one.called: prepare_robot(one, folder / "robots")
         for one in parse_requests(list(ROBOTS), "robots", ())
     }
-    target = ROOT / "docs" / "images" / "gallery.png"
+    target = IMAGES / "gallery.png"
     with use_style():
         figure = new_figure(2.0 * len(OBJECTS) + 0.3, 2.0 * len(ROBOTS) + 0.3)
         axes = figure.subplots(
@@ -209,9 +198,3 @@ def main() -> int:
                 axis.set_ylabel(ROBOTS[robot] if column == 0 else "", fontsize=10)
                 print(f"{robot}: {name}", flush=True)
         save_figure(figure, target)
-    Image.open(target).convert("RGB").quantize(COLOURS).save(target, optimize=True)
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

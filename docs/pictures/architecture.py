@@ -1,6 +1,4 @@
-"""Draws docs/images/architecture.svg from the package's imports with the standard library alone.
-
-Usage: python docs/make_architecture.py
+"""Draws docs/images/architecture.svg from the package's imports.
 
 Rows are the layers of the import contract in pyproject.toml. An arrow leads from a package to one
 that it imports, unless others lead there too. Packages that all others import have no arrows.
@@ -12,11 +10,10 @@ import ast
 import textwrap
 import tomllib
 from html import escape
-from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
+from docs.pictures import IMAGES, ROOT
+
 PACKAGE = ROOT / "vkc_pin"
-FILE = ROOT / "docs" / "images" / "architecture.svg"
 FOUNDATION = {"errors", "utils", "options"}  # imported by all others
 CHECKS = {"validation"}
 COLUMN = {
@@ -138,7 +135,12 @@ def draw_box(package: str, x: float, y: float) -> str:
     return "\n".join([f'<rect {corner} rx="7" class="{kind}"/>', *texts])
 
 
-def main() -> str:
+def make() -> None:
+    """Write the picture."""
+    (IMAGES / "architecture.svg").write_text(draw(), encoding="utf-8")
+
+
+def draw() -> str:
     """Return the picture."""
     rows = layers()
     centres = place_boxes(rows)
@@ -166,7 +168,3 @@ def main() -> str:
         "</svg>",
     ]
     return "\n".join(parts) + "\n"
-
-
-if __name__ == "__main__":
-    FILE.write_text(main(), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Draws docs/images/tradeoff.png from its record: `python docs/make_tradeoff.py`.
+"""Draws docs/images/tradeoff.png from its record.
 
 docs/results/tradeoff.json.gz is that of `python -m tests.benchmarks ablation` with other weights of
 the base. A point is the mean path lengths of base and arm over the problems that succeed at every
@@ -11,15 +11,14 @@ import gzip
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from docs.pictures import DOCS, IMAGES
 from vkc_pin.options import Options
 from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, use_style
 
-DOCS = Path(__file__).resolve().parent
 FIELD = "velocity_weight_base"
 
 
@@ -44,7 +43,7 @@ def points(trials: Sequence[Mapping[str, Any]]) -> list[tuple[float, float, floa
     ]
 
 
-def main() -> None:
+def make() -> None:
     """Draw the curve, and print its points as a table."""
     record = DOCS / "results" / "tradeoff.json.gz"
     drawn = points(json.loads(gzip.decompress(record.read_bytes()))["trials"])
@@ -68,10 +67,6 @@ def main() -> None:
         axes.set_xlabel("base path, mean [m]")
         axes.set_ylabel("arm path, mean [rad]")
         axes.set_title(f"Weight of a metre of the base, {drawn[0][3]} problems", fontsize=10)
-        save_figure(figure, DOCS / "images" / "tradeoff.png")
+        save_figure(figure, IMAGES / "tradeoff.png")
     for row in drawn:
         sys.stdout.write("| {:g} | {:.3f} | {:.3f} | {} |\n".format(*row))
-
-
-if __name__ == "__main__":
-    main()

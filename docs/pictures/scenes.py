@@ -1,8 +1,4 @@
-"""Makes docs/images and docs/animations: plans, scenes, imports and bases.
-
-Needs Chromium. Usage: make_images.py [DOOR [STICK [CHORE [GAP]]]]: saved plans (.npz) to show
-instead of planning them.
-"""
+"""Makes pictures and animations of plans, scenes, imports and bases. Needs Chromium."""
 
 from __future__ import annotations
 
@@ -15,8 +11,14 @@ from typing import Any
 import nbformat
 import numpy as np
 import pinocchio as pin
+from helpers.browser import save_screenshot
+from helpers.door_closers import load_door_with_closer
+from helpers.grippers import write_cheeks_scene, write_gripper
+from helpers.homes import write_home_urdf
 
 import vkc_pin as vkc
+from docs.pictures import DOCS, IMAGES, ROOT
+from tests.benchmarks import gap
 from vkc_pin.experiments import chores
 from vkc_pin.importing.pictures import plot_attachments
 from vkc_pin.utils.arrays import Floats
@@ -30,8 +32,6 @@ from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.trajectory.torques import Torques
 from vkc_pin.world.trajectory.world_model import World
 
-ROOT = Path(__file__).parent.parent
-IMAGES = ROOT / "docs" / "images"
 WIDE, SMALL = (1200, 640), (640, 400)  # [pixels]
 SHOWN = 0  # number of the start from which the robot drives through the gap
 LEAVING = 0.6  # share of the duration of the task in the home
@@ -60,14 +60,6 @@ OPENED = {
     "dishwasher": ("rack", 0.5),
     "refrigerator": ("hinge", 1.4),
 }
-
-sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
-from helpers.browser import save_screenshot  # noqa: E402
-from helpers.door_closers import load_door_with_closer  # noqa: E402
-from helpers.grippers import write_cheeks_scene, write_gripper  # noqa: E402
-from helpers.homes import write_home_urdf  # noqa: E402
-
-from tests.benchmarks import gap  # noqa: E402
 
 
 def look(target: tuple[float, ...], position: tuple[float, ...]) -> None:
@@ -239,7 +231,7 @@ def chore_pictures(chore: vkc.Plan) -> None:
     """Write a picture of the chore in the home, and the page that shows all of it."""
     look(*HOME)
     picture(chore, "household_chore", WIDE, LEAVING)
-    visualization.to_html(chore, ROOT / "docs" / "animations" / "household_chore.html")
+    visualization.to_html(chore, DOCS / "animations" / "household_chore.html")
 
 
 def gap_picture(through: vkc.Plan) -> None:
@@ -387,29 +379,18 @@ def torque_picture() -> None:
         save_figure(figure, IMAGES / "torques.png")
 
 
-def main() -> int:
-    """Write the pictures; return 1 if there is no motion to show."""
-    saved = [vkc.Plan.load(name) for name in sys.argv[1:]]
+def make() -> None:
+    """Write the pictures."""
     use = [vkc.Grasp("stick"), vkc.Touch("stick.tip", (-1, 3.897, 0.1))]
-    door = (
-        saved[0]
-        if saved
-        else vkc.plan(vkc.load_scene("door"), [vkc.Actuate("door", {"hinge": 1.2})])
-    )
-    stick = (
-        saved[1]
-        if len(saved) > 1
-        else vkc.plan(vkc.load_scene("init_3"), use, initialization="astar")
-    )
+    door = vkc.plan(vkc.load_scene("door"), [vkc.Actuate("door", {"hinge": 1.2})])
+    stick = vkc.plan(vkc.load_scene("init_3"), use, initialization="astar")
     home = vkc.load_scene("household")
-    chore = saved[2] if len(saved) > 2 else vkc.plan(home, chores.home(home), window=2)
-    through = (
-        saved[3] if len(saved) > 3 else vkc.plan(gap.make_start(0, SHOWN), [vkc.Reach(gap.POSE)])
-    )
+    chore = vkc.plan(home, chores.home(home), window=2)
+    through = vkc.plan(gap.make_start(0, SHOWN), [vkc.Reach(gap.POSE)])
     for plan in (door, stick, chore, through):
         sys.stdout.write(plan.summary() + "\n")
         if not plan.success:
-            return 1
+            raise SystemExit("there is no motion to show")
     attachments()
     picture(door, "door", WIDE, HALF_OPEN)
     plots(door, "door", "joints")
@@ -439,8 +420,3 @@ def main() -> int:
     pull_picture()
     opening_picture()
     torque_picture()
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,4 +1,4 @@
-"""Finds out how a free object stands where the robot lets go of it."""
+"""Finds out how a free object stands where the robot releases it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Footing:
     """How a free object stands.
 
     Attributes:
-        supports: Labels of what it rests on, sorted; empty in mid-air.
+        supports: Labels of its supports, sorted; empty in mid-air.
         height: Height of the free fall to what is below it [m]; 0 if it rests or touches; inf
             without anything below.
         below: Label of what is below it; empty without anything.

@@ -27,9 +27,9 @@ class Footing:
 
     Attributes:
         supports: Labels of its supports, sorted; empty in mid-air.
-        height: Height of the free fall to what is below it [m]; 0 if it rests or touches; inf
-            without anything below.
-        below: Label of what is below it; empty without anything.
+        height: Height of the free fall onto the shape below it [m]; 0 if it rests or touches; inf
+            without any.
+        below: Label of the shape below it; empty without any.
         overhang: How far its centre of mass is beyond the convex hull of its contacts with its
             supports, the larger one of x and y [m].
     """
@@ -176,7 +176,7 @@ def _compute_overhang(
 
 
 def _measure_fall(placed: PlacedObject, others: Iterable[LabelledShape]) -> Footing:
-    """Return the footing of an object in mid-air: how far it is above what is below."""
+    """Return the footing of an object in mid-air, with the height of its fall."""
     nearest = Footing(())
     height = np.inf
     for one in make_world_shapes(placed):

@@ -121,6 +121,7 @@ class _Compiler:
     def _append(
         self, kind: PhaseKind, about: tuple[str, ...], segments: int, **details: Any
     ) -> None:
+        """Add a phase to the state of the task, and bring the state to the end of the phase."""
         before = self.scene.holds
         lifted = dict[Hold, pin.SE3]()  # free objects that the last phase grasped
         if self.phases:
@@ -198,7 +199,7 @@ class _Compiler:
                     others = [other for other in open_attachment.others if other in attachments]
                     self.open[same] = replace(open_attachment, others=tuple(others))
                 return same
-        self._check_can_grasp(placed, by, where)
+        self._prepare_grasp(placed, by, where)
         if not any(hold in phase.grasps for phase in self.phases):
             others = [other for other in placed.object.attachments if other in attachments[1:]]
             self.open[hold] = OpenAttachment(self.step, name, tuple(others))
@@ -213,8 +214,11 @@ class _Compiler:
         self.resting.pop(name, None)
         return hold
 
-    def _check_can_grasp(self, placed: PlacedObject, by: str | None, where: str) -> None:
-        """Check that an object can be grasped now; a hand releases fixed objects before."""
+    def _prepare_grasp(self, placed: PlacedObject, by: str | None, where: str) -> None:
+        """Check that an object can be grasped now, after the hand has released fixed objects.
+
+        A held object that grasps, `by`, leaves the other holds as they are.
+        """
         name = placed.name
         held = self._find_hold(name)
         if held is not None and placed.object.free:
@@ -294,6 +298,7 @@ class _Compiler:
         return hold, link
 
     def actuate(self, step: Actuate, where: str) -> None:
+        """Add the phases that grasp an object, release its latches and bring joints to values."""
         placed = find_object(self.scene, step.object, f"{where}.object")
         if placed.object.free:
             problem = f"'{step.object}' is a free object: a hand cannot drive its joints"

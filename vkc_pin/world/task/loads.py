@@ -29,7 +29,8 @@ def check_footings(scene: Scene, tasks: Sequence[Task]) -> None:
     """Check that every free object rests on something where it is released.
 
     A placement that only the motion decides is left to the validation of the motion, as is that of
-    what is put down where such an object may be. An object may be put back where the scene has it.
+    an object that is put down where such an object may be. An object may be put back where the
+    scene has it.
 
     Args:
         scene: Scene in which the first task starts.

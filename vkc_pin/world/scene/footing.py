@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.hulls import compute_hull
-from vkc_pin.world.models.dynamics import compute_solid_inertia
+from vkc_pin.world.models.dynamics import compute_inertia, compute_solid_inertia
 from vkc_pin.world.models.shapes import compute_world_box, triangulate
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 from vkc_pin.world.scene.support import RESTING_DISTANCE, find_supporting_pairs
@@ -97,22 +97,13 @@ def _compute_centre(objects: Sequence[PlacedObject]) -> Floats:
     """
     total = pin.Inertia.Zero()
     for placed in objects:
-        if placed.object.mass > 0.0:
-            total += placed.placement.act(_compute_inertia(placed))
+        item = placed.object
+        if item.mass > 0.0:
+            inertia = compute_inertia(item.model, item.coordinates.q(placed.state))
+            total += placed.placement.act(inertia)
         else:
             total += _fill_with_water(placed)
     return np.asarray(total.lever)
-
-
-def _compute_inertia(placed: PlacedObject) -> pin.Inertia:
-    """Return the inertia of an object with its joint values, in the frame of its base link."""
-    item = placed.object
-    data = item.model.createData()
-    pin.forwardKinematics(item.model, data, item.coordinates.q(placed.state))
-    total = pin.Inertia.Zero()
-    for joint_placement, inertia in zip(data.oMi, item.model.inertias, strict=True):
-        total = total + joint_placement.act(inertia)
-    return total
 
 
 def _fill_with_water(placed: PlacedObject) -> pin.Inertia:

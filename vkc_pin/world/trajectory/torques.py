@@ -11,8 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.world.models.articulated_object import ArticulatedObject
-from vkc_pin.world.models.dynamics import TorqueLimits
+from vkc_pin.world.models.dynamics import TorqueLimits, compute_inertia
 from vkc_pin.world.scene.contact_rules import compute_hand_frame
 from vkc_pin.world.scene.hold import Hold, get_attachment
 from vkc_pin.world.scene.placed_object import PlacedObject
@@ -364,7 +363,8 @@ class Torques:
         tool = model.frames[model.getFrameId(self.scene.robot.tool_frame)]
         hand = tool.parentJoint
         for name in (*carried, *supports):
-            own_inertia = _compute_inertia(objects[name].object, objects[name].state)
+            item = objects[name].object
+            own_inertia = compute_inertia(item.model, item.coordinates.q(objects[name].state))
             placement = pin.XYZQUATToSE3(placements[name][0])
             world_inertia = placement.act(own_inertia)
             owner, _, link = supports.get(name, "").partition(".")
@@ -419,16 +419,6 @@ def _compute_jacobians(
         rotations[k] = rotation
         origins[k] = origin
     return jacobians, rotations, origins
-
-
-def _compute_inertia(item: ArticulatedObject, state: Floats) -> pin.Inertia:
-    """Compute an object's total inertia in the base frame at joint values `state`, (n,)."""
-    data = item.model.createData()
-    pin.forwardKinematics(item.model, data, item.coordinates.q(state))
-    total = pin.Inertia.Zero()
-    for placement, inertia in zip(data.oMi, item.model.inertias, strict=True):
-        total = total + placement.act(inertia)
-    return total
 
 
 def transform_to_base_axes(

@@ -21,40 +21,40 @@ const char * const PINOCCHIO_RELEASE = PINOCCHIO_VERSION;
 
 namespace {
 
-pinocchio::SE3 placement(const double * numbers)
+pinocchio::SE3 to_placement(const double * numbers)
 {
   return pinocchio::SE3(Eigen::Map<const Eigen::Matrix3d>(numbers), Eigen::Map<const Eigen::Vector3d>(numbers + 9));
 }
 
 } // namespace
 
-struct Bodies::Placing::Work
+struct Bodies::Kinematics::Work
 {
-  explicit Work(const Known & known);
+  explicit Work(const Shared & shared);
 
   pinocchio::Data data;
   Eigen::VectorXd q;
   std::vector<double> shapes, rotations, translations;
 };
 
-struct Bodies::Known
+struct Bodies::Shared
 {
   pinocchio::Model model;
   std::vector<std::size_t> joints;
   std::vector<pinocchio::SE3> placements;
   // Pool of unused work buffers, whose construction takes longer than their use.
-  std::vector<std::unique_ptr<Placing::Work>> idle;
+  std::vector<std::unique_ptr<Kinematics::Work>> idle;
   std::mutex mutex;
 };
 
-Bodies::Placing::Work::Work(const Known & known)
-: data(known.model), q(known.model.nq), shapes(PLACEMENT * known.joints.size()), rotations(9 * known.model.njoints),
-  translations(3 * known.model.njoints)
+Bodies::Kinematics::Work::Work(const Shared & shared)
+: data(shared.model), q(shared.model.nq), shapes(PLACEMENT * shared.joints.size()), rotations(9 * shared.model.njoints),
+  translations(3 * shared.model.njoints)
 {
 }
 
 Bodies::Bodies(const std::string & model, std::size_t shapes, const std::int64_t * joints, const double * placements)
-: known_(std::make_unique<Known>())
+: shared_(std::make_unique<Shared>())
 {
   boost::asio::streambuf buffer;
   buffer.commit(boost::asio::buffer_copy(buffer.prepare(model.size()), boost::asio::buffer(model)));
@@ -62,72 +62,72 @@ Bodies::Bodies(const std::string & model, std::size_t shapes, const std::int64_t
   loaded.loadFromBinary(buffer);
   // Pinocchio 4.1 does not serialize `m_nqExtended` of mimic joints and would read out of bounds; a
   // cast initializes it.
-  known_->model = loaded.cast<double>();
+  shared_->model = loaded.cast<double>();
   for (std::size_t k = 0; k < shapes; ++k)
   {
-    if (joints[k] < 0 || joints[k] >= known_->model.njoints)
+    if (joints[k] < 0 || joints[k] >= shared_->model.njoints)
       throw std::out_of_range("no such joint");
-    known_->joints.push_back(std::size_t(joints[k]));
-    known_->placements.push_back(placement(placements + PLACEMENT * k));
+    shared_->joints.push_back(std::size_t(joints[k]));
+    shared_->placements.push_back(to_placement(placements + PLACEMENT * k));
   }
 }
 
 Bodies::~Bodies() = default;
 
-std::size_t Bodies::shapes() const { return known_->joints.size(); }
+std::size_t Bodies::shapes() const { return shared_->joints.size(); }
 
-std::size_t Bodies::joints() const { return std::size_t(known_->model.njoints); }
+std::size_t Bodies::joints() const { return std::size_t(shared_->model.njoints); }
 
-std::size_t Bodies::coordinates() const { return std::size_t(known_->model.nq); }
+std::size_t Bodies::coordinates() const { return std::size_t(shared_->model.nq); }
 
-Bodies::Placing::Placing(const Bodies & bodies) : bodies_(bodies)
+Bodies::Kinematics::Kinematics(const Bodies & bodies) : bodies_(bodies)
 {
-  Known & known = *bodies.known_;
+  Shared & shared = *bodies.shared_;
   {
-    const std::lock_guard<std::mutex> lock(known.mutex);
-    if (!known.idle.empty())
+    const std::lock_guard<std::mutex> lock(shared.mutex);
+    if (!shared.idle.empty())
     {
-      work_ = std::move(known.idle.back());
-      known.idle.pop_back();
+      work_ = std::move(shared.idle.back());
+      shared.idle.pop_back();
     }
   }
   if (!work_)
-    work_ = std::make_unique<Work>(known);
+    work_ = std::make_unique<Work>(shared);
 }
 
-Bodies::Placing::~Placing()
+Bodies::Kinematics::~Kinematics()
 {
-  Known & known = *bodies_.known_;
-  const std::lock_guard<std::mutex> lock(known.mutex);
-  known.idle.push_back(std::move(work_));
+  Shared & shared = *bodies_.shared_;
+  const std::lock_guard<std::mutex> lock(shared.mutex);
+  shared.idle.push_back(std::move(work_));
 }
 
-void Bodies::Placing::at(const double * configuration)
+void Bodies::Kinematics::compute(const double * configuration)
 {
-  const Known & known = *bodies_.known_;
+  const Shared & shared = *bodies_.shared_;
   Work & work = *work_;
   std::copy_n(configuration, work.q.size(), work.q.data());
-  pinocchio::forwardKinematics(known.model, work.data, work.q);
+  pinocchio::forwardKinematics(shared.model, work.data, work.q);
   for (std::size_t j = 0; j < work.data.oMi.size(); ++j)
   {
     const auto & placed = work.data.oMi[j];
     Eigen::Map<Eigen::Matrix<double, 3, 3, Eigen::RowMajor>>(work.rotations.data() + 9 * j) = placed.rotation();
     Eigen::Map<Eigen::Vector3d>(work.translations.data() + 3 * j) = placed.translation();
   }
-  for (std::size_t k = 0; k < known.joints.size(); ++k)
+  for (std::size_t k = 0; k < shared.joints.size(); ++k)
   {
-    const std::size_t joint = known.joints[k];
-    const pinocchio::SE3 placed = joint ? work.data.oMi[joint] * known.placements[k] : known.placements[k];
+    const std::size_t joint = shared.joints[k];
+    const pinocchio::SE3 placed = joint ? work.data.oMi[joint] * shared.placements[k] : shared.placements[k];
     double * numbers = work.shapes.data() + PLACEMENT * k;
     Eigen::Map<Eigen::Matrix3d>{numbers} = placed.rotation();
     Eigen::Map<Eigen::Vector3d>{numbers + 9} = placed.translation();
   }
 }
 
-const double * Bodies::Placing::shapes() const { return work_->shapes.data(); }
+const double * Bodies::Kinematics::shapes() const { return work_->shapes.data(); }
 
-const double * Bodies::Placing::rotations() const { return work_->rotations.data(); }
+const double * Bodies::Kinematics::rotations() const { return work_->rotations.data(); }
 
-const double * Bodies::Placing::translations() const { return work_->translations.data(); }
+const double * Bodies::Kinematics::translations() const { return work_->translations.data(); }
 
 } // namespace vkc_pin

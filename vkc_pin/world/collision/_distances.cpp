@@ -33,16 +33,16 @@ NB_MODULE(_distances, module)
   module.def("mesh", &mesh);
   nb::class_<Shapes>(module, "Shapes")
     .def(nb::init<const std::vector<Solid> &, const Numbers<2> &, double>())
-    .def("placed", &Shapes::placed)
-    .def("distances", &Shapes::distances)
-    .def("shortest", &Shapes::shortest);
+    .def("placed", &Shapes::move_fixed)
+    .def("distances", &Shapes::compute_distances)
+    .def("shortest", &Shapes::find_closest_pairs);
   module.def("distance", &distance);
-  module.def("asked", [] { return asked.load(); });
+  module.def("asked", [] { return query_count.load(); });
   nb::class_<Boxes>(module, "Boxes")
     .def(
       nb::init<
         const Indices<1> &, const Numbers<3> &, const Numbers<2> &, const Numbers<2> &, const Indices<2> &>())
-    .def("placed", &Boxes::placed);
+    .def("placed", &Boxes::move_fixed);
   nb::class_<Bodies>(module, "Bodies")
     .def(
       "__init__",
@@ -51,15 +51,15 @@ NB_MODULE(_distances, module)
           throw std::invalid_argument("placements are of shape (n, 12)");
         new (self) Bodies(std::string(model.c_str(), model.size()), joints.shape(0), joints.data(), placements.data());
       })
-    .def("placements", &placements);
+    .def("placements", &compute_placements);
   nb::class_<Margins>(module, "Margins")
     .def(nb::init<const Numbers<1> &>())
-    .def("ease", &Margins::ease)
-    .def("near", &Margins::near)
-    .def("at", &Margins::at_all);
+    .def("ease", &Margins::relax)
+    .def("near", &Margins::add_region)
+    .def("at", &Margins::compute_margins);
   nb::class_<WorldBoxes>(module, "WorldBoxes")
     .def(nb::init<const Numbers<3> &, const Numbers<3> &, const Numbers<2> &, const Numbers<2> &>())
     .def("near", &WorldBoxes::near);
-  module.def("nearest", &nearest);
+  module.def("nearest", &find_closest_pairs);
   module.def("count_free", &count_free);
 }

@@ -27,13 +27,13 @@ public:
   std::size_t coordinates() const;
 
   // Evaluates the kinematics; not thread-safe.
-  class Placing
+  class Kinematics
   {
   public:
-    explicit Placing(const Bodies & bodies);
-    ~Placing();
+    explicit Kinematics(const Bodies & bodies);
+    ~Kinematics();
 
-    void at(const double * configuration);
+    void compute(const double * configuration);
 
     const double * shapes() const;       // placements of the shapes, 12 numbers each
     const double * rotations() const;    // of the joints, 9 numbers each, row-major
@@ -47,8 +47,8 @@ public:
   };
 
 private:
-  struct Known;
-  std::unique_ptr<Known> known_;
+  struct Shared;
+  std::unique_ptr<Shared> shared_;
 };
 
 extern const char * const PINOCCHIO_RELEASE; // release that this module was compiled against

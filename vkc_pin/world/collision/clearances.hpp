@@ -51,40 +51,42 @@ struct States
       parts.boxes.size() != parts.shapes.size() || parts.boxes.moving() != parts.shapes.moving()
       || parts.bodies.shapes() != parts.shapes.moving() || parts.margins.size() != parts.boxes.pairs().size())
       throw std::invalid_argument("bodies, boxes, shapes and margins do not belong together");
-    if (parts.boxes.most_joints() >= Index(parts.bodies.joints()))
+    if (parts.boxes.max_joint() >= Index(parts.bodies.joints()))
       throw std::out_of_range("no such joint");
   }
 };
 
 // Evaluates one configuration at a time.
-class Clearing
+class ClearanceQuery
 {
 public:
-  Clearing(const Parts & parts, const States & states, double reach, double rounding)
-  : parts_(parts), states_(states), placing_(parts.bodies), look_(parts.boxes, reach), ask_(parts.shapes), reach_(reach),
-    rounding_(rounding)
+  ClearanceQuery(const Parts & parts, const States & states, double reach, double rounding)
+  : parts_(parts), states_(states), kinematics_(parts.bodies), box_query_(parts.boxes, reach),
+    distance_query_(parts.shapes), reach_(reach), rounding_(rounding)
   {
   }
 
-  // Returns at most `most` pairs closer than `reach` at a configuration, sorted by distance −
+  // Returns at most `max_pairs` pairs closer than `reach` at a configuration, sorted by distance −
   // margin.
-  const std::vector<Shapes::Found> & nearest(std::size_t state, Index waypoint, bool standing, Index most)
+  const std::vector<Shapes::Found> & find_closest_pairs(
+    std::size_t state, Index waypoint, bool include_fixed, Index max_pairs)
   {
-    prepare(state, waypoint, standing);
-    near_.clear();
-    ask_.nearest(candidates_.size(), reach_, most, rounding_, near_, [this](std::size_t k) { return candidates_[k]; });
-    return near_;
+    prepare(state, waypoint, include_fixed);
+    closest_.clear();
+    const auto candidate = [this](std::size_t k) { return candidates_[k]; };
+    distance_query_.find_closest_pairs(candidates_.size(), reach_, max_pairs, rounding_, closest_, candidate);
+    return closest_;
   }
 
   // Returns whether any pair closer than `reach` violates its margin by more than `allowed`.
-  bool blocked(std::size_t state, Index waypoint, double allowed)
+  bool has_violation(std::size_t state, Index waypoint, double allowed)
   {
     prepare(state, waypoint, true);
     for (const auto & candidate : candidates_)
     {
       if (candidate.bound > rounding_ - allowed)
         return false; // since candidates are sorted by their bounds
-      const double distance = ask_.distance(candidate.first, candidate.second);
+      const double distance = distance_query_.compute_distance(candidate.first, candidate.second);
       if (distance < reach_ && candidate.margin - distance > allowed)
         return true;
     }
@@ -94,15 +96,15 @@ public:
 private:
   // Finds candidate pairs by their bounding boxes, sorted by their lower bounds of distance −
   // margin.
-  void prepare(std::size_t state, Index waypoint, bool standing)
+  void prepare(std::size_t state, Index waypoint, bool include_fixed)
   {
-    placing_.at(states_.q + state * states_.coordinates);
+    kinematics_.compute(states_.q + state * states_.coordinates);
     found_.clear();
-    look_.at(state, placing_.rotations(), placing_.translations(), standing, found_);
+    box_query_.find_close_pairs(state, kinematics_.rotations(), kinematics_.translations(), include_fixed, found_);
     candidates_.clear();
     for (const auto & found : found_)
     {
-      const double margin = parts_.margins.at(found.pair, waypoint, states_.z + state * states_.columns);
+      const double margin = parts_.margins.compute_margin(found.pair, waypoint, states_.z + state * states_.columns);
       if (margin == -std::numeric_limits<double>::infinity())
         continue;
       const auto & pair = parts_.boxes.pairs()[std::size_t(found.pair)];
@@ -111,23 +113,23 @@ private:
     std::sort(candidates_.begin(), candidates_.end(), [](const auto & a, const auto & b) {
       return std::tie(a.bound, a.rank) < std::tie(b.bound, b.rank);
     });
-    ask_.at(placing_.shapes());
-    ask_.moved();
+    distance_query_.set_placements(kinematics_.shapes());
+    distance_query_.invalidate();
   }
 
   const Parts & parts_;
   const States & states_;
-  Bodies::Placing placing_;
-  Boxes::Looking look_;
-  Shapes::Asking ask_;
+  Bodies::Kinematics kinematics_;
+  Boxes::Query box_query_;
+  Shapes::Query distance_query_;
   double reach_, rounding_;
   std::vector<Boxes::Found> found_;
   std::vector<Shapes::Candidate> candidates_;
-  std::vector<Shapes::Found> near_;
+  std::vector<Shapes::Found> closest_;
 };
 
 // Placements of the shapes of bodies, (W, n, 12).
-Array<double> placements(const Bodies & bodies, const Numbers<2> & q)
+Array<double> compute_placements(const Bodies & bodies, const Numbers<2> & q)
 {
   if (q.shape(1) != bodies.coordinates())
     throw std::invalid_argument("configurations are of shape (W, nq)");
@@ -135,11 +137,11 @@ Array<double> placements(const Bodies & bodies, const Numbers<2> & q)
   std::vector<double> found(states * size);
   {
     nb::gil_scoped_release released;
-    Bodies::Placing placing(bodies);
+    Bodies::Kinematics kinematics(bodies);
     for (std::size_t s = 0; s < states; ++s)
     {
-      placing.at(q.data() + s * q.shape(1));
-      std::copy_n(placing.shapes(), size, found.begin() + std::ptrdiff_t(s * size));
+      kinematics.compute(q.data() + s * q.shape(1));
+      std::copy_n(kinematics.shapes(), size, found.begin() + std::ptrdiff_t(s * size));
     }
   }
   return handed_over(std::move(found), {states, shapes, PLACEMENT});
@@ -147,7 +149,7 @@ Array<double> placements(const Bodies & bodies, const Numbers<2> & q)
 
 // State, pair, distance, margin, normal and witness points of the pairs with least distance −
 // margin; see distances.py.
-std::tuple<Array<Index>, Array<Index>, Array<double>, Array<double>, Array<double>, Array<double>, Array<double>> nearest(
+std::tuple<Array<Index>, Array<Index>, Array<double>, Array<double>, Array<double>, Array<double>, Array<double>> find_closest_pairs(
   const Bodies & bodies,
   const Boxes & boxes,
   const Shapes & shapes,
@@ -156,8 +158,8 @@ std::tuple<Array<Index>, Array<Index>, Array<double>, Array<double>, Array<doubl
   const Numbers<2> & z,
   const Indices<1> & waypoints,
   double reach,
-  Index most,
-  bool standing,
+  Index max_pairs,
+  bool include_fixed,
   double rounding,
   std::size_t threads)
 {
@@ -173,9 +175,9 @@ std::tuple<Array<Index>, Array<Index>, Array<double>, Array<double>, Array<doubl
     threads = std::max<std::size_t>(threads, 1);
     std::vector<std::vector<std::pair<std::size_t, Shapes::Found>>> found(threads);
     in_parts(states.count, threads, [&](std::size_t part, std::size_t begin, std::size_t end) {
-      Clearing clearing(parts, states, reach, rounding);
+      ClearanceQuery query(parts, states, reach, rounding);
       for (std::size_t s = begin; s < end; ++s)
-        for (const auto & near : clearing.nearest(s, waypoint[s], standing, most))
+        for (const auto & near : query.find_closest_pairs(s, waypoint[s], include_fixed, max_pairs))
           found[part].emplace_back(s, near);
     });
     for (const auto & part : found)
@@ -220,11 +222,11 @@ Array<Index> count_free(
   std::vector<Index> free(edges.shape(0) - 1);
   {
     nb::gil_scoped_release released;
-    Clearing clearing(parts, states, reach, rounding);
+    ClearanceQuery query(parts, states, reach, rounding);
     for (std::size_t run = 0; run < free.size(); ++run)
     {
       Index state = edge[run];
-      while (state < edge[run + 1] && !clearing.blocked(std::size_t(state), waypoint, allowed))
+      while (state < edge[run + 1] && !query.has_violation(std::size_t(state), waypoint, allowed))
         ++state;
       free[run] = state - edge[run];
     }

@@ -41,7 +41,7 @@ inline bool is_round(const coal::CollisionGeometry & shape)
   return shape.getNodeType() == coal::GEOM_SPHERE || shape.getNodeType() == coal::GEOM_CAPSULE;
 }
 
-inline Core core_of(const coal::CollisionGeometry & shape, const Transform3s & where)
+inline Core get_core(const coal::CollisionGeometry & shape, const Transform3s & where)
 {
   const double swept = static_cast<const coal::ShapeBase &>(shape).getSweptSphereRadius();
   if (shape.getNodeType() == coal::GEOM_SPHERE)
@@ -51,7 +51,7 @@ inline Core core_of(const coal::CollisionGeometry & shape, const Transform3s & w
 }
 
 // A unit vector perpendicular to both vectors, either of which may be zero.
-inline Vec3s perpendicular(const Vec3s & one, const Vec3s & other)
+inline Vec3s find_perpendicular(const Vec3s & one, const Vec3s & other)
 {
   const Vec3s across = one.cross(other);
   if (across.norm() > MEETING)
@@ -62,7 +62,7 @@ inline Vec3s perpendicular(const Vec3s & one, const Vec3s & other)
   return axis.isZero() ? Vec3s(Vec3s::UnitX()) : Vec3s(axis.cross(Vec3s::Unit(least)).normalized());
 }
 
-inline void set(coal::DistanceResult & result, double distance, const Vec3s & normal, const Vec3s & first)
+inline void set_result(coal::DistanceResult & result, double distance, const Vec3s & normal, const Vec3s & first)
 {
   result.min_distance = distance;
   result.normal = normal;
@@ -76,11 +76,11 @@ inline void separate_cores(const Core & one, const Core & other, coal::DistanceR
   const double distance = result.min_distance;
   if (distance + one.radius + other.radius > MEETING)
     return;
-  const Vec3s normal = perpendicular(one.axis, other.axis);
+  const Vec3s normal = find_perpendicular(one.axis, other.axis);
   // coal's witness points of meeting cores lie on the surfaces, opposite each other.
-  const double share = one.radius / (one.radius + other.radius);
-  const Vec3s meeting = result.nearest_points[0] * (1.0 - share) + result.nearest_points[1] * share;
-  set(result, distance, normal, meeting + one.radius * normal);
+  const double fraction = one.radius / (one.radius + other.radius);
+  const Vec3s meeting = result.nearest_points[0] * (1.0 - fraction) + result.nearest_points[1] * fraction;
+  set_result(result, distance, normal, meeting + one.radius * normal);
 }
 
 // The nearest surface of a cylinder may be its lateral surface or one of its ends.
@@ -107,9 +107,9 @@ inline void leave_cylinder(
   const double surface = std::min(radial, axial) + cylinder.getSweptSphereRadius();
   const double distance = -surface - sphere.radius;
   if (sphere_is_first)
-    set(result, distance, -outwards, sphere.centre - sphere.radius * outwards);
+    set_result(result, distance, -outwards, sphere.centre - sphere.radius * outwards);
   else
-    set(result, distance, outwards, sphere.centre + surface * outwards);
+    set_result(result, distance, outwards, sphere.centre + surface * outwards);
 }
 
 inline double signed_distance(
@@ -124,11 +124,11 @@ inline double signed_distance(
   if (distance > 0.0 || !(is_round(one) || is_round(other)))
     return distance;
   if (is_round(one) && is_round(other))
-    separate_cores(core_of(one, where), core_of(other, there), result);
+    separate_cores(get_core(one, where), get_core(other, there), result);
   else if (one.getNodeType() == coal::GEOM_CYLINDER && other.getNodeType() == coal::GEOM_SPHERE)
-    leave_cylinder(static_cast<const coal::Cylinder &>(one), where, core_of(other, there), false, result);
+    leave_cylinder(static_cast<const coal::Cylinder &>(one), where, get_core(other, there), false, result);
   else if (one.getNodeType() == coal::GEOM_SPHERE && other.getNodeType() == coal::GEOM_CYLINDER)
-    leave_cylinder(static_cast<const coal::Cylinder &>(other), there, core_of(one, where), true, result);
+    leave_cylinder(static_cast<const coal::Cylinder &>(other), there, get_core(one, where), true, result);
   return result.min_distance;
 }
 

@@ -37,7 +37,7 @@ void copy_witness(const coal::DistanceResult & result, double * out)
     out = std::copy_n(numbers->data(), 3, out);
 }
 
-std::atomic<std::uint64_t> asked{0}; // number of distances computed since the process began
+std::atomic<std::uint64_t> query_count{0}; // number of distances computed since the process began
 
 class Shapes
 {
@@ -61,17 +61,17 @@ public:
 
   // Queries coal at one state at a time. Results are cleared between queries, since a warm start
   // would change the last digits.
-  class Asking
+  class Query
   {
   public:
-    explicit Asking(const Shapes & shapes)
-    : shapes_(shapes), request_(shapes.request_), places_(shapes.moving_), known_(shapes.moving_, 0)
+    explicit Query(const Shapes & shapes)
+    : shapes_(shapes), request_(shapes.request_), transforms_(shapes.moving_), transform_states_(shapes.moving_, 0)
     {
     }
 
-    ~Asking() { asked += count_; }
+    ~Query() { query_count += count_; }
 
-    void at(const double * placements)
+    void set_placements(const double * placements)
     {
       if (placements != placements_)
         ++state_;
@@ -79,29 +79,36 @@ public:
     }
 
     // Must be called when the numbers behind the current placements have changed.
-    void moved() { ++state_; }
+    void invalidate() { ++state_; }
 
-    double distance(Index first, Index second)
+    double compute_distance(Index first, Index second)
     {
       ++count_;
       result_.clear();
-      const auto &one = place(std::size_t(first)), &other = place(std::size_t(second));
+      const auto &one = get_transform(std::size_t(first)), &other = get_transform(std::size_t(second));
       return signed_distance(*shapes_.shapes_[first], one, *shapes_.shapes_[second], other, request_, result_);
     }
 
-    // Of candidates sorted by their bounds, selects at most `most` closer than `reach` with least
-    // distance − margin; see shapes.py.
+    // Of candidates sorted by their bounds, selects at most `max_pairs` closer than `reach` with least
+    // distance − margin; see distances.py.
     template<typename Candidates>
-    void nearest(
-      std::size_t count, double reach, Index most, double rounding, std::vector<Found> & near, const Candidates & candidates)
+    void find_closest_pairs(
+      std::size_t count,
+      double reach,
+      Index max_pairs,
+      double rounding,
+      std::vector<Found> & near,
+      const Candidates & candidates)
     {
       for (std::size_t k = 0; k < count; ++k)
       {
         const Candidate candidate = candidates(k);
-        if (most >= 0 && Index(near.size()) >= most && (most == 0 || candidate.bound > near[most - 1].shortfall + rounding))
-          break; // neither this candidate nor any later one can be among them
+        const bool is_full = max_pairs >= 0 && Index(near.size()) >= max_pairs;
+        // Then neither this candidate nor any later one can be among them.
+        if (is_full && (max_pairs == 0 || candidate.bound > near[max_pairs - 1].shortfall + rounding))
+          break;
         Found found;
-        found.distance = distance(candidate.first, candidate.second);
+        found.distance = compute_distance(candidate.first, candidate.second);
         if (!(found.distance < reach))
           continue;
         found.shortfall = found.distance - candidate.margin;
@@ -111,47 +118,47 @@ public:
         witness(found.witness);
         near.insert(std::upper_bound(near.begin(), near.end(), found), found);
       }
-      if (most >= 0 && Index(near.size()) > most)
-        near.resize(most);
+      if (max_pairs >= 0 && Index(near.size()) > max_pairs)
+        near.resize(max_pairs);
     }
 
     void witness(double * out) const { copy_witness(result_, out); }
 
   private:
-    const coal::Transform3s & place(std::size_t shape)
+    const coal::Transform3s & get_transform(std::size_t shape)
     {
       if (shape >= shapes_.moving_)
-        return shapes_.standing_[shape - shapes_.moving_];
-      if (known_[shape] != state_)
+        return shapes_.fixed_[shape - shapes_.moving_];
+      if (transform_states_[shape] != state_)
       {
-        places_[shape] = transform(placements_ + PLACEMENT * shape);
-        known_[shape] = state_;
+        transforms_[shape] = transform(placements_ + PLACEMENT * shape);
+        transform_states_[shape] = state_;
       }
-      return places_[shape];
+      return transforms_[shape];
     }
 
     const Shapes & shapes_;
     coal::DistanceRequest request_;
     coal::DistanceResult result_;
-    std::vector<coal::Transform3s> places_;
-    std::vector<std::size_t> known_;
+    std::vector<coal::Transform3s> transforms_;
+    std::vector<std::size_t> transform_states_;
     const double * placements_ = nullptr;
     std::size_t state_ = 0, count_ = 0;
   };
 
-  Shapes(const std::vector<Solid> & solids, const Numbers<2> & standing, double tolerance)
+  Shapes(const std::vector<Solid> & solids, const Numbers<2> & fixed, double tolerance)
   {
-    if (standing.shape(1) != PLACEMENT || standing.shape(0) > solids.size())
+    if (fixed.shape(1) != PLACEMENT || fixed.shape(0) > solids.size())
       throw std::invalid_argument("placements of fixed shapes are of shape (S, 12), with at most as many shapes");
     for (const auto & solid : solids)
       shapes_.push_back(solid.geometry);
-    moving_ = shapes_.size() - standing.shape(0);
-    for (std::size_t i = 0; i < standing.shape(0); ++i)
-      standing_.push_back(transform(standing.data() + PLACEMENT * i));
+    moving_ = shapes_.size() - fixed.shape(0);
+    for (std::size_t i = 0; i < fixed.shape(0); ++i)
+      fixed_.push_back(transform(fixed.data() + PLACEMENT * i));
     request_ = make_request(tolerance);
   }
 
-  Shapes placed(const Indices<1> & which, const Numbers<2> & where) const
+  Shapes move_fixed(const Indices<1> & which, const Numbers<2> & where) const
   {
     if (where.shape(0) != which.shape(0) || where.shape(1) != PLACEMENT)
       throw std::invalid_argument("placements are of shape (n, 12)");
@@ -160,15 +167,15 @@ public:
     {
       if (which(k) < Index(moving_) || which(k) >= Index(shapes_.size()))
         throw std::out_of_range("not a fixed shape");
-      other.standing_[which(k) - moving_] = transform(where.data() + PLACEMENT * k);
+      other.fixed_[which(k) - moving_] = transform(where.data() + PLACEMENT * k);
     }
     return other;
   }
 
-  Array<double> distances(
-    const Numbers<3> & moving, const Indices<1> & states, const Indices<2> & pairs, bool everything, std::size_t threads) const
+  Array<double> compute_distances(
+    const Numbers<3> & moving, const Indices<1> & states, const Indices<2> & pairs, bool with_witnesses, std::size_t threads) const
   {
-    const std::size_t count = pairs.shape(0), columns = everything ? COLUMNS : 1;
+    const std::size_t count = pairs.shape(0), columns = with_witnesses ? COLUMNS : 1;
     check(moving, pairs);
     if (states.shape(0) != count)
       throw std::invalid_argument("as many states as pairs are needed");
@@ -181,31 +188,31 @@ public:
     {
       nb::gil_scoped_release released;
       in_parts(count, threads, [&](std::size_t, std::size_t first, std::size_t last) {
-        Asking ask(*this);
+        Query query(*this);
         for (std::size_t i = first; i < last; ++i)
         {
-          ask.at(where + std::size_t(state[i]) * moving_ * PLACEMENT);
-          found[i * columns] = ask.distance(pair[2 * i], pair[2 * i + 1]);
-          if (everything)
-            ask.witness(found.data() + i * columns + 1);
+          query.set_placements(where + std::size_t(state[i]) * moving_ * PLACEMENT);
+          found[i * columns] = query.compute_distance(pair[2 * i], pair[2 * i + 1]);
+          if (with_witnesses)
+            query.witness(found.data() + i * columns + 1);
         }
       });
     }
-    if (everything)
+    if (with_witnesses)
       return handed_over(std::move(found), {count, COLUMNS});
     return handed_over(std::move(found), {count});
   }
 
   // For each state, the candidates from `edges[state]` to `edges[state + 1]` with least distance −
-  // margin; see shapes.py.
-  std::tuple<Array<Index>, Array<double>> shortest(
+  // margin; see distances.py.
+  std::tuple<Array<Index>, Array<double>> find_closest_pairs(
     const Numbers<3> & moving,
     const Indices<1> & edges,
     const Indices<2> & pairs,
     const Indices<1> & ranks,
     const Numbers<2> & limits,
     double reach,
-    Index most,
+    Index max_pairs,
     double rounding,
     std::size_t threads) const
   {
@@ -227,16 +234,18 @@ public:
       threads = std::max<std::size_t>(threads, 1);
       std::vector<std::vector<Found>> parts(threads);
       in_parts(states, threads, [&](std::size_t part, std::size_t first, std::size_t last) {
-        Asking ask(*this);
+        Query query(*this);
         std::vector<Found> near;
         for (std::size_t s = first; s < last; ++s)
         {
           near.clear();
-          ask.at(where + s * moving_ * PLACEMENT);
-          ask.nearest(std::size_t(edge[s + 1] - edge[s]), reach, most, rounding, near, [&](std::size_t k) {
+          query.set_placements(where + s * moving_ * PLACEMENT);
+          const auto candidate = [&](std::size_t k) {
             const Index i = edge[s] + Index(k);
             return Candidate{pair[2 * i], pair[2 * i + 1], rank[i], i, limit[2 * i], limit[2 * i + 1]};
-          });
+          };
+          const std::size_t candidate_count = std::size_t(edge[s + 1] - edge[s]);
+          query.find_closest_pairs(candidate_count, reach, max_pairs, rounding, near, candidate);
           parts[part].insert(parts[part].end(), near.begin(), near.end());
         }
       });
@@ -270,7 +279,7 @@ private:
   }
 
   std::vector<std::shared_ptr<coal::CollisionGeometry>> shapes_;
-  std::vector<coal::Transform3s> standing_;
+  std::vector<coal::Transform3s> fixed_;
   std::size_t moving_;
   coal::DistanceRequest request_;
 };
@@ -286,7 +295,7 @@ Array<double> distance(
   found[0] = signed_distance(
     *one.geometry, transform(where.data()), *other.geometry, transform(there.data()), make_request(tolerance), result);
   copy_witness(result, found.data() + 1);
-  ++asked;
+  ++query_count;
   return handed_over(std::move(found), {COLUMNS});
 }
 

@@ -62,7 +62,7 @@ Solid primitive(const std::string & kind, const std::vector<double> & numbers, d
   return {shape};
 }
 
-std::vector<coal::Vec3s> corners_of(const Numbers<2> & points)
+std::vector<coal::Vec3s> to_corners(const Numbers<2> & points)
 {
   if (points.shape(1) != 3)
     throw std::invalid_argument("points are of shape (n, 3)");
@@ -73,7 +73,7 @@ std::vector<coal::Vec3s> corners_of(const Numbers<2> & points)
   return corners;
 }
 
-std::vector<coal::Triangle> triangles_of(const Indices<2> & faces, std::size_t points)
+std::vector<coal::Triangle> to_triangles(const Indices<2> & faces, std::size_t points)
 {
   if (faces.shape(1) != 3)
     throw std::invalid_argument("faces are of shape (m, 3)");
@@ -92,8 +92,8 @@ std::vector<coal::Triangle> triangles_of(const Indices<2> & faces, std::size_t p
 
 Solid convex(const Numbers<2> & points, const Indices<2> & faces, double swept_sphere_radius)
 {
-  auto corners = std::make_shared<std::vector<coal::Vec3s>>(corners_of(points));
-  auto triangles = std::make_shared<std::vector<coal::Triangle>>(triangles_of(faces, corners->size()));
+  auto corners = std::make_shared<std::vector<coal::Vec3s>>(to_corners(points));
+  auto triangles = std::make_shared<std::vector<coal::Triangle>>(to_triangles(faces, corners->size()));
   auto shape = std::make_shared<coal::Convex<coal::Triangle>>(
     corners, unsigned(corners->size()), triangles, unsigned(triangles->size()));
   shape->setSweptSphereRadius(swept_sphere_radius);
@@ -102,8 +102,8 @@ Solid convex(const Numbers<2> & points, const Indices<2> & faces, double swept_s
 
 Solid mesh(const Numbers<2> & points, const Indices<2> & faces)
 {
-  const auto corners = corners_of(points);
-  const auto triangles = triangles_of(faces, corners.size());
+  const auto corners = to_corners(points);
+  const auto triangles = to_triangles(faces, corners.size());
   auto model = std::make_shared<coal::BVHModel<coal::OBBRSS>>();
   model->beginModel(unsigned(triangles.size()), unsigned(corners.size()));
   model->addSubModel(corners, triangles);

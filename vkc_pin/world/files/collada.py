@@ -105,7 +105,7 @@ class _Reader:
         return [] if scene is None else scene.findall("node")
 
     def _read_node(self, node: ElementTree.Element) -> Surface:
-        """Return what a node shows, in the frame that contains it."""
+        """Return the surface of a node and of those below it, in the frame that contains it."""
         if id(node) in self._surfaces:
             return self._surfaces[id(node)]
         if node in self._ancestors:

@@ -1,7 +1,8 @@
 """Reads SRDF files: allowed collisions, named configurations, and groups of joints.
 
-The elements mean what they mean to MoveIt (`src/model.cpp` of github.com/moveit/srdfdom): elements
-that name unknown links, joints or groups are skipped, one by one, and noted.
+The elements have the meaning that MoveIt gives them (`src/model.cpp` of
+github.com/moveit/srdfdom): those that name unknown links, joints or groups are skipped, one by
+one, and noted.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ class Srdf:
         allowed: Sorted pair of links that may collide → reason.
         states: Named configurations, in the order of the file.
         groups: Groups with joints, by name.
-        notes: What was skipped.
+        notes: Skipped elements.
     """
 
     allowed: dict[Pair, str] = field(default_factory=dict)

@@ -132,6 +132,16 @@ def compute_mass(model: pin.Model) -> float:
     return float(sum(inertia.mass for inertia in model.inertias))
 
 
+def compute_inertia(model: pin.Model, q: Floats) -> pin.Inertia:
+    """Return the inertia of all links of a model at q, shape (nq,), in the universe frame."""
+    data = model.createData()
+    pin.forwardKinematics(model, data, q)
+    total = pin.Inertia.Zero()
+    for placement, inertia in zip(data.oMi, model.inertias, strict=True):
+        total = total + placement.act(inertia)
+    return total
+
+
 def set_mass(model: pin.Model, collision: pin.GeometryModel, mass: float) -> None:
     """Scale the inertias of a model to a given total mass.
 

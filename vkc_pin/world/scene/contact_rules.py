@@ -20,8 +20,8 @@ The planner and the independent validation both implement these rules.
   model; see `clearance_exemptions`.
 - A free object that overlaps its surroundings where it is first lifted may leave them within
   `CONTACT_WINDOW`.
-- An object grasped at the start counts as lifted there: it may leave what it touches or overlaps
-  within `CONTACT_WINDOW`.
+- An object grasped at the start counts as lifted there: it may leave shapes that it touches or
+  overlaps within `CONTACT_WINDOW`.
 - Pairs that the scene allows keep the scene's margin, or none; see `Scene.allowed`.
 
 The gripper opening is that of the attachment it holds or grasps next. It changes where an object is

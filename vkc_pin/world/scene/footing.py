@@ -1,4 +1,4 @@
-"""Finds out how a free object stands where the robot lets go of it."""
+"""Finds out how a free object stands where the robot releases it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.hulls import compute_hull
-from vkc_pin.world.models.dynamics import compute_solid_inertia
+from vkc_pin.world.models.dynamics import compute_inertia, compute_solid_inertia
 from vkc_pin.world.models.shapes import compute_world_box, triangulate
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 from vkc_pin.world.scene.support import RESTING_DISTANCE, find_supporting_pairs
@@ -26,10 +26,10 @@ class Footing:
     """How a free object stands.
 
     Attributes:
-        supports: Labels of what it rests on, sorted; empty in mid-air.
-        height: Height of the free fall to what is below it [m]; 0 if it rests or touches; inf
-            without anything below.
-        below: Label of what is below it; empty without anything.
+        supports: Labels of its supports, sorted; empty in mid-air.
+        height: Height of the free fall onto the shape below it [m]; 0 if it rests or touches; inf
+            without any.
+        below: Label of the shape below it; empty without any.
         overhang: How far its centre of mass is beyond the convex hull of its contacts with its
             supports, the larger one of x and y [m].
     """
@@ -97,22 +97,13 @@ def _compute_centre(objects: Sequence[PlacedObject]) -> Floats:
     """
     total = pin.Inertia.Zero()
     for placed in objects:
-        if placed.object.mass > 0.0:
-            total += placed.placement.act(_compute_inertia(placed))
+        item = placed.object
+        if item.mass > 0.0:
+            inertia = compute_inertia(item.model, item.coordinates.q(placed.state))
+            total += placed.placement.act(inertia)
         else:
             total += _fill_with_water(placed)
     return np.asarray(total.lever)
-
-
-def _compute_inertia(placed: PlacedObject) -> pin.Inertia:
-    """Return the inertia of an object with its joint values, in the frame of its base link."""
-    item = placed.object
-    data = item.model.createData()
-    pin.forwardKinematics(item.model, data, item.coordinates.q(placed.state))
-    total = pin.Inertia.Zero()
-    for joint_placement, inertia in zip(data.oMi, item.model.inertias, strict=True):
-        total = total + joint_placement.act(inertia)
-    return total
 
 
 def _fill_with_water(placed: PlacedObject) -> pin.Inertia:
@@ -176,7 +167,7 @@ def _compute_overhang(
 
 
 def _measure_fall(placed: PlacedObject, others: Iterable[LabelledShape]) -> Footing:
-    """Return the footing of an object in mid-air: how far it is above what is below."""
+    """Return the footing of an object in mid-air, with the height of its fall."""
     nearest = Footing(())
     height = np.inf
     for one in make_world_shapes(placed):

@@ -112,8 +112,9 @@ class Scene:
     memory: dict[Any, Any] = dataclasses.field(default_factory=dict, init=False, repr=False)
 
     def __repr__(self) -> str:
+        objects = ", ".join(self.objects) or "none"
         return (
-            f"<Scene {self.name}: {self.robot.name}, objects {', '.join(self.objects) or 'none'}, "
+            f"<Scene {self.name}: {self.robot.name}, objects {objects}, "
             f"{len(self.obstacle_names)} obstacles>"
         )
 
@@ -146,9 +147,8 @@ class Scene:
         from vkc_pin.world.files.documents import Document
         from vkc_pin.world.scene.scene_file import make_scene_fields
 
-        fields = make_scene_fields(
-            Document(check_mapping(document, "document")), check_path(folder, "folder")
-        )
+        data = Document(check_mapping(document, "document"))
+        fields = make_scene_fields(data, check_path(folder, "folder"))
         return _check_new_scene(Scene(**fields)._with())
 
     def with_robot(
@@ -179,18 +179,18 @@ class Scene:
         """
         check_instance(name, (str, Path), "name")
         is_path = isinstance(name, Path) or "/" in name or Path(name).suffix in _ROBOT_FILES
-        robot = {
-            "name": str(Path(name).absolute()) if is_path else name,
-            "base": base,
-            "tool_frame": tool_frame,
-            "turning_radius": turning_radius,
-        }
-        start = {"base": self.start[:3].tolist(), "z": height}
-        document = {
-            **self.document,
-            "robot": {key: value for key, value in robot.items() if value is not None},
-            "start": {key: value for key, value in start.items() if value is not None},
-        }
+        robot: dict[str, Any] = {"name": str(Path(name).absolute()) if is_path else name}
+        if base is not None:
+            robot["base"] = base
+        if tool_frame is not None:
+            robot["tool_frame"] = tool_frame
+        if turning_radius is not None:
+            robot["turning_radius"] = turning_radius
+        start: dict[str, Any] = {"base": self.start[:3].tolist()}
+        if height is not None:
+            start["z"] = height
+        document = self.document
+        document.update(robot=robot, start=start)
         return Scene.from_document(document, self.folder)
 
     def with_start(
@@ -208,28 +208,36 @@ class Scene:
             InputError: Wrong size, a value that is not finite, outside a joint's limits or outside
                 the arena.
         """
-        start, names = self.start.copy(), self.robot.coordinates.names
+        names = self.robot.coordinates.names
+        start = self.start.copy()
         if isinstance(arm, Mapping):
             arm = self._fill_arm(arm)
-        for part_name, values, part in (("base", base, slice(0, 3)), ("arm", arm, slice(3, None))):
-            if values is None:
-                continue
-            given = check_array(values, part_name)
-            if given.shape != start[part].shape:
-                problem, expected = "wrong number of values", start[part].shape
-                raise InputError(problem, field=part_name, expected=expected, got=given.shape)
-            lower, upper = (limits[part] for limits in self.robot.start_limits)
-            start[part] = [
-                check_start_value(value, low, high, f"{part_name}.{name}")
-                for value, low, high, name in zip(given, lower, upper, names[part], strict=True)
-            ]
-        start[:2] = [
-            clamp_to_limits(value, low, high, f"base.{name}", "outside the arena")
-            for value, low, high, name in zip(
-                start[:2], self.arena[::2], self.arena[1::2], names[:2], strict=True
-            )
-        ]
+        if base is not None:
+            start[:3] = self._check_start_values(base, "base", slice(0, 3))
+        if arm is not None:
+            start[3:] = self._check_start_values(arm, "arm", slice(3, None))
+        x_min, x_max, y_min, y_max = self.arena
+        problem = "outside the arena"
+        start[0] = clamp_to_limits(start[0], x_min, x_max, f"base.{names[0]}", problem)
+        start[1] = clamp_to_limits(start[1], y_min, y_max, f"base.{names[1]}", problem)
         return self._with(start=start)
+
+    def _check_start_values(self, values: ArrayLike, field: str, part: slice) -> list[float]:
+        """Return the values of a `part` of the coordinates at the start."""
+        given = check_array(values, field)
+        if given.shape != self.start[part].shape:
+            raise InputError(
+                "wrong number of values",
+                field=field,
+                expected=self.start[part].shape,
+                got=given.shape,
+            )
+        lower, upper = self.robot.start_limits
+        names = self.robot.coordinates.names[part]
+        checked = list[float]()
+        for value, low, high, name in zip(given, lower[part], upper[part], names, strict=True):
+            checked.append(check_start_value(value, low, high, f"{field}.{name}"))
+        return checked
 
     def _fill_arm(self, given: Mapping[str, float]) -> list[float]:
         """Return the values of all arm joints; those that are not named stay."""
@@ -237,8 +245,8 @@ class Scene:
         values = check_mapping(given, "arm", "joint → value")
         for joint in values:
             check_choice(joint, names, f"arm joint of robot '{self.robot.name}'", "arm")
-        stay = zip(names, self.start[3:].tolist(), strict=True)
-        return [values.get(joint, value) for joint, value in stay]
+        current = dict(zip(names, self.start[3:].tolist(), strict=True))
+        return [values.get(joint, current[joint]) for joint in names]
 
     def with_state(self, name: str, values: Mapping[str, float]) -> Scene:
         """Return the scene with joints of object `name` at `values`.
@@ -251,9 +259,8 @@ class Scene:
             UnknownNameError: There is no such object, or it has no such joint.
             InputError: A value is not finite or outside the joint's limits.
         """
-        return self._with(
-            objects=freeze({**self.objects, name: self._find_object(name).with_state(values)})
-        )
+        placed = self._find_object(name).with_state(values)
+        return self._with(objects=freeze({**self.objects, name: placed}))
 
     def with_placement(self, name: str, placement: pin.SE3) -> Scene:
         """Return the scene with object `name` at another placement.
@@ -266,10 +273,10 @@ class Scene:
             UnknownNameError: There is no such object.
             InputError: `placement` is not a pose.
         """
-        placed = dataclasses.replace(
-            self._find_object(name), placement=as_placement(placement, name="placement")
-        )
-        return self._with(objects=freeze({**self.objects, name: placed}))
+        placed = self._find_object(name)
+        pose = as_placement(placement, name="placement")
+        moved = dataclasses.replace(placed, placement=pose)
+        return self._with(objects=freeze({**self.objects, name: moved}))
 
     def with_held(
         self,
@@ -298,11 +305,11 @@ class Scene:
                 measured grasp is more than 20 mm or 0.2 rad from its attachment.
         """
         holds = check_hold_order(make_holds(held, by, at) if isinstance(held, Mapping) else held)
-        poses = check_mapping({} if measured is None else measured, "measured")
-        for name in poses:
-            names = [hold.object for hold in holds]
+        names = [hold.object for hold in holds]
+        stated = check_mapping({} if measured is None else measured, "measured")
+        for name in stated:
             check_choice(name, names, "held object", f"measured.{name}")
-        poses = {name: as_placement(pose, name=f"measured.{name}") for name, pose in poses.items()}
+        poses = {name: as_placement(pose, name=f"measured.{name}") for name, pose in stated.items()}
         return self._with(holds=resolve_holds(self.objects, holds, poses))
 
     def with_measured_grasp(
@@ -338,17 +345,24 @@ class Scene:
             pose = as_placement(placement, name="placement")
             placed = dataclasses.replace(placed, placement=pose)
         placed = placed.with_state({} if state is None else state)
-        before = next((hold for hold in self.holds if hold.object == name), None)
-        if attachment is None and before is not None:
-            attachment = before.attachment
-        grasp = placed.object.attachment(attachment)
-        by, link = (None, None) if before is None else (before.by, before.link)
-        hold = Hold(name, grasp.name, by, link)
+        before = None
+        for one in self.holds:
+            if one.object == name:
+                before = one
+                break
+        if before is None:
+            grasp = placed.object.attachment(attachment)
+            hold = Hold(name, grasp.name)
+            holds = [*self.holds, hold]
+        else:
+            grasp = placed.object.attachment(
+                before.attachment if attachment is None else attachment
+            )
+            hold = Hold(name, grasp.name, before.by, before.link)
+            holds = [_replace_hold(one, before, hold) for one in self.holds]
         moved = self.with_start(base, arm)
         objects = freeze({**moved.objects, name: placed})
         measured = {name: measure_grasp(objects, hold, moved.tool_placement)}
-        holds = [_replace_hold(one, before, hold) for one in self.holds]
-        holds += [hold] if before is None else []
         return moved._with(objects=objects, holds=resolve_holds(objects, holds, measured))
 
     def with_approaches(self, holds: Iterable[Hold], *, stacklevel: int = 2) -> Scene:
@@ -361,22 +375,32 @@ class Scene:
             holds: Holds whose approaches are checked.
             stacklevel: Stack level of the warnings, as for `warnings.warn`.
         """
-        floor = [
-            shape
-            for shape, label in zip(self.obstacles, self.obstacle_labels, strict=True)
-            if label == FLOOR
-        ]
+        floor, _ = self._divide_obstacles()
         objects = dict(self.objects)
-        for hold in find_reversed_approaches(
+        blocked = find_reversed_approaches(
             self.objects, holds, self.robot, list_placed_shapes(floor)
-        ):
+        )
+        for hold in blocked:
             objects[hold.object] = objects[hold.object].with_reversed(hold.attachment)
-            what = f"{hold.frame or 'the hand'} would approach {hold.object}.{hold.attachment}"
-            text = f"{what} through the object or the floor, so its approach is reversed"
-            hint = f"turn its approach, or set `reversed: [{hold.attachment}]` for the object"
-            warnings.warn(f"{self.file or self.name}: {text}; {hint}", stacklevel=stacklevel)
-        changed = objects != dict(self.objects)
-        return self._with(objects=freeze(objects)) if changed else self
+            warnings.warn(
+                f"{self.file or self.name}: {hold.frame or 'the hand'} would approach "
+                f"{hold.object}.{hold.attachment} through the object or the floor, so its approach "
+                f"is reversed; turn its approach, or set `reversed: [{hold.attachment}]` for the "
+                "object",
+                stacklevel=stacklevel,
+            )
+        if objects == dict(self.objects):
+            return self
+        return self._with(objects=freeze(objects))
+
+    def _divide_obstacles(self) -> tuple[list[pin.GeometryObject], list[pin.GeometryObject]]:
+        """Return the shapes of the floor, and those of the other obstacles."""
+        floor = list[pin.GeometryObject]()
+        others = list[pin.GeometryObject]()
+        for shape, label in zip(self.obstacles, self.obstacle_labels, strict=True):
+            group = floor if label == FLOOR else others
+            group.append(shape)
+        return floor, others
 
     def _find_object(self, name: str) -> PlacedObject:
         return self.objects[check_choice(name, self.objects, "object")]
@@ -384,10 +408,8 @@ class Scene:
     def _with(self, **fields: Any) -> Scene:
         """Return the scene with other attributes, and with free held objects placed in the hand."""
         changed = dataclasses.replace(self, **fields)
-        changed = dataclasses.replace(
-            changed,
-            objects=place_held_objects(changed.objects, changed.tool_placement, changed.holds),
-        )
+        objects = place_held_objects(changed.objects, changed.tool_placement, changed.holds)
+        changed = dataclasses.replace(changed, objects=objects)
         # Only copies made here share the cache: `dataclasses.replace` may change obstacles.
         object.__setattr__(changed, "memory", self.memory)
         return changed
@@ -412,25 +434,21 @@ class Scene:
         reach = float(min(reach, 1e300))
         model = self.robot.model
         geometry = self.robot.opened(self.robot.opening(self.opening)).collision
-        data, shapes = model.createData(), geometry.createData()
-        pin.updateGeometryPlacements(
-            model, data, geometry, shapes, self.robot.coordinates.q(self.start)
-        )
+        model_data = model.createData()
+        geometry_data = geometry.createData()
+        q = self.robot.coordinates.q(self.start)
+        pin.updateGeometryPlacements(model, model_data, geometry, geometry_data, q)
         moving = [
-            (shape.geometry, where)
-            for shape, where in zip(geometry.geometryObjects, shapes.oMg, strict=True)
+            (shape.geometry, placement)
+            for shape, placement in zip(geometry.geometryObjects, geometry_data.oMg, strict=True)
         ]
-        standing = [
-            shape
-            for shape, label in zip(self.obstacles, self.obstacle_labels, strict=True)
-            if label != FLOOR
-        ]
+        _, others = self._divide_obstacles()
         for name, placed in self.objects.items():
             if name not in self.held:
-                standing += make_world_shapes(placed)
+                others += make_world_shapes(placed)
             elif placed.object.free:
                 moving += list_placed_shapes(make_world_shapes(placed))
-        return compute_clearance(moving, list_placed_shapes(standing), reach=reach)
+        return compute_clearance(moving, list_placed_shapes(others), reach=reach)
 
     def sample_start(self, rng: np.random.Generator) -> Scene:
         """Return the scene with the base at a random collision-free pose in its start region.
@@ -446,33 +464,40 @@ class Scene:
                 pose was found.
         """
         check_instance(rng, np.random.Generator, "rng")
-        region, file = self.start_region, self.file
-        if region is None:
-            problem, expected = "the scene has no start region", "x and y intervals"
-            raise InputError(problem, file=file, field="start_region", expected=expected)
+        if self.start_region is None:
+            raise InputError(
+                "the scene has no start region",
+                file=self.file,
+                field="start_region",
+                expected="x and y intervals",
+            )
         for name in self.held:
             if not self.objects[name].object.free:
                 raise InputError(
                     "the start cannot be sampled while the robot holds a fixed object",
-                    file=file,
+                    file=self.file,
                     field=f"start.held.{name}",
                 )
-        for base in itertools.islice(region.sample_poses(rng), _MAX_TRIES):
+        poses = self.start_region.sample_poses(rng)
+        for base in itertools.islice(poses, _MAX_TRIES):
             candidate = self.with_start(base=base)
             if candidate.start_clearance(reach=START_CLEARANCE) >= START_CLEARANCE:
                 return candidate
-        problem = f"no collision-free start of the robot in {_MAX_TRIES} attempts"
-        expected = f"a clearance of {START_CLEARANCE} m somewhere"
-        raise InputError(problem, file=file, field="start_region", expected=expected)
+        raise InputError(
+            f"no collision-free start of the robot in {_MAX_TRIES} attempts",
+            file=self.file,
+            field="start_region",
+            expected=f"a clearance of {START_CLEARANCE} m somewhere",
+        )
 
 
-def _replace_hold(one: Hold, before: Hold | None, hold: Hold) -> Hold:
+def _replace_hold(one: Hold, before: Hold, hold: Hold) -> Hold:
     """Return a hold with `before` replaced, be it the hold itself or one it depends on."""
     if one == before:
         return hold
-    return (
-        one if one.by is None else dataclasses.replace(one, by=_replace_hold(one.by, before, hold))
-    )
+    if one.by is None:
+        return one
+    return dataclasses.replace(one, by=_replace_hold(one.by, before, hold))
 
 
 def load_scene(name_or_path: str | Path) -> Scene:
@@ -493,21 +518,18 @@ def load_scene(name_or_path: str | Path) -> Scene:
     file = path / "scene.yaml" if path.is_dir() else path
     if file == path or not file.is_file():
         file = find_file(name_or_path, "scenes", "*.yaml", noun="scene")
-    return _check_new_scene(Scene(**make_scene_fields(read_yaml(file), file.parent))._with())
+    fields = make_scene_fields(read_yaml(file), file.parent)
+    return _check_new_scene(Scene(**fields)._with())
 
 
 def _check_new_scene(scene: Scene) -> Scene:
     """Return a new scene with corrected approaches; warn of probable mistakes."""
-    warn_of_overlaps(scene, str(scene.file or scene.name))
-    warn_of_openings(scene.objects, scene.robot, scene.opening, str(scene.file or scene.name))
-    undecided = [
-        item.name
-        for item in scene.described.objects
-        if item.reversed is None and item.name not in scene.held
-    ]
-    holds = (
-        Hold(name, attachment)
-        for name in undecided
-        for attachment in scene.objects[name].object.attachments
-    )
+    source = str(scene.file or scene.name)
+    warn_of_overlaps(scene, source)
+    warn_of_openings(scene.objects, scene.robot, scene.opening, source)
+    holds = list[Hold]()
+    for item in scene.described.objects:
+        if item.reversed is None and item.name not in scene.held:
+            attachments = scene.objects[item.name].object.attachments
+            holds += [Hold(item.name, attachment) for attachment in attachments]
     return scene.with_approaches(holds, stacklevel=4)

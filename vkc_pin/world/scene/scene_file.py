@@ -43,15 +43,17 @@ def make_scene_fields(document: Document, folder: Path) -> dict[str, Any]:
     description = parse_document(document, schema.SceneSchema)
     robot = _load_robot(document, description, folder)
     _check_unique_names(document, description)
-    objects = {
-        item.name: _load_object(document, ("objects", index), item, folder)
-        for index, item in enumerate(description.objects)
-    }
+    objects = dict[str, PlacedObject]()
+    for index, placed_item in enumerate(description.objects):
+        placed = _load_object(document, ("objects", index), placed_item, folder)
+        objects[placed_item.name] = placed
     arena = (*description.arena.x, *description.arena.y)
-    obstacles, visual, labels = list[pin.GeometryObject](), list[pin.GeometryObject](), list[str]()
+    obstacles = list[pin.GeometryObject]()
+    labels = list[str]()
+    visual = list[pin.GeometryObject]()
     for index, item in enumerate(description.obstacles):
-        drawn, shapes = _load_obstacle(document, ("obstacles", index), item, folder)
-        visual += drawn
+        visual_shapes, shapes = _load_obstacle(document, ("obstacles", index), item, folder)
+        visual += visual_shapes
         obstacles += shapes
         labels += [item.name] * len(shapes)
     if description.floor:
@@ -89,80 +91,103 @@ def make_document(fields: Mapping[str, Any]) -> dict[str, Any]:
     Args:
         fields: Attributes of a `Scene`, by name.
     """
-    described, start, objects, region = (
-        fields[key] for key in ("described", "start", "objects", "start_region")
-    )
+    described = fields["described"]
+    start = fields["start"]
+    objects = fields["objects"]
+    region = fields["start_region"]
     plain = described.model_dump(
         mode="json", include={"robot", "obstacles", "objects", "allow"}, exclude_none=True
     )
-    held = {}
-    for hold in fields["holds"]:
-        entries: dict[str, Any] = {
-            "attachment": hold.attachment,
-            "by": hold.frame,
-            "at": list(hold.at) if any(hold.at) else None,
-        }
-        if hold.deviation:
-            grasp = get_attachment(objects, hold)
-            pose = pin.SE3ToXYZQUAT(grasp.motion(hold.at).inverse())
-            entries["at"] = list(hold.at) or None
-            entries["measured"] = {"position": pose[:3].tolist(), "quaternion": pose[3:].tolist()}
-        held[hold.object] = {key: value for key, value in entries.items() if value is not None}
+    held = {hold.object: _describe_hold(hold, objects) for hold in fields["holds"]}
     for item, entry in zip(described.objects, plain["objects"], strict=True):
-        placed = objects[item.name]
-        names = placed.object.coordinates.names
-        neutral = np.clip(0.0, placed.object.lower, placed.object.upper)
-        entry["state"] = dict(zip(names, placed.state.tolist(), strict=True))
-        in_hand = placed.object.free and item.name in held
-        moved = not in_hand and not np.array_equal(
-            placed.placement.homogeneous, _make_pose(item).homogeneous
-        )
-        entry.pop("reversed", None)
-        as_described = not moved and entry["state"] == {
-            **dict(zip(names, neutral.tolist(), strict=True)),
-            **item.state,
-        }
-        # Otherwise loading the document finds the same approaches again.
-        if placed.reversed or item.reversed is not None or not as_described:
-            entry["reversed"] = list(placed.reversed)
-        if moved:
-            for orientation in ("yaw", "quaternion"):
-                entry.pop(orientation, None)
-            entry["position"] = placed.placement.translation.tolist()
-            entry["rpy"] = pin.rpy.matrixToRpy(placed.placement.rotation).tolist()
-    at_home = described.start.arm is None and np.array_equal(start[3:], fields["robot"].home)
-    return {
+        _update_object_entry(entry, item, objects[item.name], is_held=item.name in held)
+    start_entry: dict[str, Any] = {"base": start[:3].tolist()}
+    if described.start.z is not None:
+        start_entry["z"] = described.start.z
+    if fields["opening"] is not None:
+        start_entry["opening"] = fields["opening"]
+    is_at_home = np.array_equal(start[3:], fields["robot"].home)
+    if described.start.arm is not None or not is_at_home:
+        start_entry["arm"] = start[3:].tolist()
+    start_entry["held"] = held
+    document = {
         "name": fields["name"],
         "robot": plain["robot"],
-        "start": {
-            "base": start[:3].tolist(),
-            **({} if described.start.z is None else {"z": described.start.z}),
-            **({} if fields["opening"] is None else {"opening": fields["opening"]}),
-            **({} if at_home else {"arm": start[3:].tolist()}),
-            "held": held,
-        },
+        "start": start_entry,
         "arena": {"x": list(fields["arena"][:2]), "y": list(fields["arena"][2:])},
-        **(
-            {"start_region": {key: list(value) for key, value in vars(region).items() if value}}
-            if region
-            else {}
-        ),
-        "floor": fields["floor"],
-        "obstacles": plain["obstacles"],
-        "objects": plain["objects"],
-        **({"allow": plain["allow"]} if plain["allow"] else {}),
     }
+    if region:
+        intervals = {key: list(value) for key, value in vars(region).items() if value}
+        document["start_region"] = intervals
+    document["floor"] = fields["floor"]
+    document["obstacles"] = plain["obstacles"]
+    document["objects"] = plain["objects"]
+    if plain["allow"]:
+        document["allow"] = plain["allow"]
+    return document
+
+
+def _describe_hold(hold: Hold, objects: Mapping[str, PlacedObject]) -> dict[str, Any]:
+    """Return a hold as plain data; see `scene_schema.HeldSchema`."""
+    entry: dict[str, Any] = {"attachment": hold.attachment}
+    if hold.frame is not None:
+        entry["by"] = hold.frame
+    if any(hold.at) or (hold.deviation and hold.at):
+        entry["at"] = list(hold.at)
+    if hold.deviation:
+        grasp = get_attachment(objects, hold)
+        pose = pin.SE3ToXYZQUAT(grasp.motion(hold.at).inverse())
+        entry["measured"] = {"position": pose[:3].tolist(), "quaternion": pose[3:].tolist()}
+    return entry
+
+
+def _update_object_entry(
+    entry: dict[str, Any],
+    item: schema.PlacedObjectSchema,
+    placed: PlacedObject,
+    *,
+    is_held: bool,
+) -> None:
+    """Make the entry of an object that of the object as it is placed.
+
+    Args:
+        entry: Plain data of its description, changed in place.
+        item: Its description.
+        placed: The object.
+        is_held: Whether the robot holds it.
+    """
+    names = placed.object.coordinates.names
+    entry["state"] = dict(zip(names, placed.state.tolist(), strict=True))
+    entry.pop("reversed", None)
+    is_in_hand = placed.object.free and is_held
+    described_placement = _make_pose(item).homogeneous
+    is_moved = not is_in_hand and not np.array_equal(
+        placed.placement.homogeneous, described_placement
+    )
+    neutral = np.clip(0.0, placed.object.lower, placed.object.upper)
+    described_state = {**dict(zip(names, neutral.tolist(), strict=True)), **item.state}
+    is_as_described = not is_moved and entry["state"] == described_state
+    # Otherwise loading the document finds the same approaches again.
+    if placed.reversed or item.reversed is not None or not is_as_described:
+        entry["reversed"] = list(placed.reversed)
+    if is_moved:
+        for orientation in ("yaw", "quaternion"):
+            entry.pop(orientation, None)
+        entry["position"] = placed.placement.translation.tolist()
+        entry["rpy"] = pin.rpy.matrixToRpy(placed.placement.rotation).tolist()
 
 
 def _load_robot(document: Document, description: schema.SceneSchema, folder: Path) -> Robot:
-    item, height = description.robot, description.start.z
+    item = description.robot
     is_path = item.name.endswith((".urdf", ".yaml", ".yml")) or "/" in item.name
     is_short = isinstance(document.data["robot"], str)  # robot: husky_ur5e
     with document.annotate_errors(("robot",) if is_short else ("robot", "name")):
-        name = folder / item.name if is_path else item.name
-        turning = item.turning_radius
         return load_robot(
-            name, base=item.base, tool_frame=item.tool_frame, height=height, turning_radius=turning
+            folder / item.name if is_path else item.name,
+            base=item.base,
+            tool_frame=item.tool_frame,
+            height=description.start.z,
+            turning_radius=item.turning_radius,
         )
 
 
@@ -178,30 +203,26 @@ def _check_unique_names(document: Document, description: schema.SceneSchema) -> 
                     expected="a new name",
                     got=f"{item.name}, as {used[item.name]}",
                 )
+            place = f"{group}[{index}]"
             line = document.find_line(path)
-            used[item.name] = f"{group}[{index}]" + (f" in line {line}" if line else "")
+            used[item.name] = f"{place} in line {line}" if line else place
 
 
 def _check_within_arena(
     document: Document, description: schema.SceneSchema, arena: tuple[float, float, float, float]
 ) -> None:
-    for axis, low, high, value in (
-        ("x", *arena[:2], description.start.base[0]),
-        ("y", *arena[2:], description.start.base[1]),
-    ):
+    x_min, x_max, y_min, y_max = arena
+    for index, (axis, low, high) in enumerate((("x", x_min, x_max), ("y", y_min, y_max))):
+        expected = f"{axis} from {low:g} to {high:g}"
+        value = description.start.base[index]
         if not low <= value <= high:
-            entry = ("start", "base", 0 if axis == "x" else 1)
             raise document.make_error(
-                entry, "outside the arena", expected=f"{axis} from {low:g} to {high:g}", got=value
+                ("start", "base", index), "outside the arena", expected=expected, got=value
             )
         interval = getattr(description.start_region, axis, None)
         if interval is not None and not low <= interval[0] <= interval[1] <= high:
-            path = ("start_region", axis)
             raise document.make_error(
-                path,
-                "outside the arena",
-                expected=f"{axis} from {low:g} to {high:g}",
-                got=list(interval),
+                ("start_region", axis), "outside the arena", expected=expected, got=list(interval)
             )
 
 
@@ -233,10 +254,10 @@ def _fill_arm(document: Document, given: Mapping[str, float], robot: Robot) -> l
     names = robot.coordinates.names[3:]
     for joint in given:
         if joint not in names:
-            path, kind = ("start", "arm", joint), f"arm joint of robot '{robot.name}'"
-            raise document.make_unknown_name_error(path, kind, joint, names)
-    homes = zip(names, robot.home.tolist(), strict=True)
-    return [given.get(joint, value) for joint, value in homes]
+            kind = f"arm joint of robot '{robot.name}'"
+            raise document.make_unknown_name_error(("start", "arm", joint), kind, joint, names)
+    home = dict(zip(names, robot.home.tolist(), strict=True))
+    return [given.get(joint, home[joint]) for joint in names]
 
 
 def _make_holds(
@@ -253,12 +274,17 @@ def _make_holds(
         path = ("start", "held", name)
         if name not in objects:
             raise document.make_unknown_name_error(path, "object", name, objects)
+        # Each hold alone, with the object through which it holds: errors name its entry.
         with document.annotate_errors(path):
-            owner = by.get(name, "").partition(".")[0]
-            both = {one: attachments[one] for one in (owner, name) if one in held}
-            through = {name: by[name]} if name in by else {}
-            values = {name: at[name]} if name in at else {}
-            resolve_holds(objects, make_holds(both, through, values))
+            own_attachments = {name: attachments[name]}
+            own_by = {}
+            if name in by:
+                carrier, _, _ = by[name].partition(".")
+                own_by[name] = by[name]
+                if carrier in held:
+                    own_attachments = {carrier: attachments[carrier], name: attachments[name]}
+            own_at = {name: at[name]} if name in at else {}
+            resolve_holds(objects, make_holds(own_attachments, own_by, own_at))
     with document.annotate_errors(("start", "held")):
         holds = make_holds(attachments, by, at)
         found = resolve_holds(objects, holds)
@@ -278,15 +304,15 @@ def _find_measured_poses(
 ) -> dict[str, pin.SE3]:
     """Return the stated or derived placements of attachments in the grasping frames."""
     tool = functools.partial(compute_tool_placement, robot, start)
-    derived = {name for name, item in held.items() if item.measured == "derive"}
-    now = place_held_objects(objects, tool, [one for one in holds if one.object not in derived])
+    placed_in_hand = [hold for hold in holds if held[hold.object].measured != "derive"]
+    measured_objects = place_held_objects(objects, tool, placed_in_hand)
     found = {}
     for hold in holds:
         stated = held[hold.object].measured
-        if stated is not None:
-            found[hold.object] = (
-                measure_grasp(now, hold, tool) if stated == "derive" else _make_pose(stated)
-            )
+        if stated == "derive":
+            found[hold.object] = measure_grasp(measured_objects, hold, tool)
+        elif stated is not None:
+            found[hold.object] = _make_pose(stated)
     return found
 
 
@@ -298,48 +324,66 @@ def _find_allowed_pairs(
     objects: Mapping[str, PlacedObject],
 ) -> dict[frozenset[str], float]:
     """Return pairs of link labels that may be close → margin [m]; the smallest of several."""
-    robot_labels = {link: [link] for link in robot.links}
-    labels = dict(robot_labels)
-    links = dict[str, list[str]]()  # labels by the name of the link alone
-    for name, placed in objects.items():
-        own = [f"{name}.{link}" for link in placed.object.links]
-        labels |= {label: [label] for label in own} | {name: own}
-        for link, label in zip(placed.object.links, own, strict=True):
-            links.setdefault(link, []).append(label)
-    labels |= {item.name: [item.name] for item in description.obstacles} | (
-        {FLOOR: [FLOOR]} if description.floor else {}
-    )
-    # In an SRDF, the name of a link stands for it without its object if it is the only one.
-    labels_in_srdf = dict(labels)
-    for link, found_labels in links.items():
-        if len(found_labels) == 1 and (link not in labels or link in objects):
-            labels_in_srdf[link] = found_labels
-    models = [list(robot_labels), [name for name in labels_in_srdf if name not in robot_labels]]
+    labels, srdf_labels = _list_labels(description, robot, objects)
+    robot_links = list(robot.links)
+    other_links = [name for name in srdf_labels if name not in robot_links]
     found: dict[frozenset[str], float] = {}
     for number, item in enumerate(description.allow):
-        pairs: Iterable[tuple[str, ...]] = [item.pair] if item.pair is not None else []
+        path: tuple[str | int, ...] = ("allow", number)
+        data = document.data["allow"][number]
+        pairs: Iterable[tuple[str, str]] = []
         names = labels
-        if item.srdf is not None:
-            is_short = isinstance(document.data["allow"][number], str)
-            file = _find_file(
-                document, ("allow", number, *(() if is_short else ("srdf",))), folder, item.srdf
-            )
-            pairs = _read_allowed_pairs(file, models)
-            names = labels_in_srdf
+        if item.pair is not None:
+            if not isinstance(data, list | tuple):
+                path = (*path, "pair")
+            pairs = [item.pair]
+        elif item.srdf is not None:
+            if not isinstance(data, str):
+                path = (*path, "srdf")
+            file = _find_file(document, path, folder, item.srdf)
+            pairs = _read_allowed_pairs(file, [robot_links, other_links])
+            names = srdf_labels
+        margin = -np.inf if item.margin is None else item.margin
         for pair in pairs:
             for place, name in enumerate(pair):
                 if name not in names:
-                    is_short = isinstance(document.data["allow"][number], list | tuple)
-                    raise document.make_unknown_name_error(
-                        ("allow", number, *(() if is_short else ("pair",)), place),
-                        "link, object or obstacle",
-                        name,
-                        names,
-                    )
-            margin = -np.inf if item.margin is None else item.margin
-            for both in itertools.product(*(names[name] for name in pair)):
-                found[frozenset(both)] = min(margin, found.get(frozenset(both), np.inf))
+                    kind = "link, object or obstacle"
+                    raise document.make_unknown_name_error((*path, place), kind, name, names)
+            first, second = pair
+            for labels_of_pair in itertools.product(names[first], names[second]):
+                key = frozenset(labels_of_pair)
+                found[key] = min(margin, found.get(key, np.inf))
     return found
+
+
+def _list_labels(
+    description: schema.SceneSchema, robot: Robot, objects: Mapping[str, PlacedObject]
+) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
+    """Return the names that `allow` knows, and those that its SRDFs know → their labels.
+
+    The name of an object stands for all its links.
+    """
+    labels = {link: [link] for link in robot.links}
+    labels_by_link = dict[str, list[str]]()  # by the name of a link without its object
+    for name, placed in objects.items():
+        own_labels = list[str]()
+        for link in placed.object.links:
+            label = f"{name}.{link}"
+            own_labels.append(label)
+            labels[label] = [label]
+            same_link = labels_by_link.setdefault(link, [])
+            same_link.append(label)
+        labels[name] = own_labels
+    for item in description.obstacles:
+        labels[item.name] = [item.name]
+    if description.floor:
+        labels[FLOOR] = [FLOOR]
+    # In an SRDF, the name of a link stands for it without its object if it is the only one.
+    srdf_labels = dict(labels)
+    for link, same_link in labels_by_link.items():
+        if len(same_link) == 1 and (link not in labels or link in objects):
+            srdf_labels[link] = same_link
+    return labels, srdf_labels
 
 
 def _read_allowed_pairs(file: Path, models: Sequence[Collection[str]]) -> Iterable[tuple[str, str]]:
@@ -379,10 +423,10 @@ def _find_file(document: Document, path: tuple[str | int, ...], folder: Path, na
     with document.annotate_errors(path):
         file = check_path(folder / name, "file", "the name of a file")
     if not file.is_file():
+        expected = f"a file in {folder}"
         similar = _find_similar_name(file)
-        expected = f"a file in {folder}" + (
-            f", perhaps {Path(name).with_name(similar)}" if similar else ""
-        )
+        if similar:
+            expected += f", perhaps {Path(name).with_name(similar)}"
         raise document.make_error(path, "there is no such file", expected=expected, got=name)
     return file
 
@@ -390,23 +434,22 @@ def _find_file(document: Document, path: tuple[str | int, ...], folder: Path, na
 def _find_similar_name(file: Path) -> str | None:
     """Return the most similar name in the folder of a missing file, among files of its type."""
     with contextlib.suppress(OSError):
-        return find_nearest_name(
-            file.name,
-            sorted(one.name for one in file.parent.iterdir() if one.suffix == file.suffix),
-        )
+        neighbours = [one.name for one in file.parent.iterdir() if one.suffix == file.suffix]
+        return find_nearest_name(file.name, sorted(neighbours))
     return None
 
 
 def _load_object(
     document: Document, path: tuple[str | int, ...], item: schema.PlacedObjectSchema, folder: Path
 ) -> PlacedObject:
-    at, kind = (*path, "type"), item.type
-    with document.annotate_errors(at):
-        if isinstance(kind, dict):
-            loaded = build_object(_extract_part(document, at), folder)
+    type_path = (*path, "type")
+    with document.annotate_errors(type_path):
+        if isinstance(item.type, dict):
+            loaded = build_object(_extract_part(document, type_path), folder)
+        elif item.type.endswith((".yaml", ".yml")) or "/" in item.type:
+            loaded = load_object(_find_file(document, type_path, folder, item.type))
         else:
-            is_path = kind.endswith((".yaml", ".yml")) or "/" in kind
-            loaded = load_object(_find_file(document, at, folder, kind) if is_path else kind)
+            loaded = load_object(item.type)
     neutral = np.clip(0.0, loaded.lower, loaded.upper)
     placed = PlacedObject(item.name, loaded, _make_pose(item), neutral)
     for joint, value in item.state.items():
@@ -420,10 +463,14 @@ def _load_object(
 
 def _extract_part(document: Document, path: tuple[str | int, ...]) -> Document:
     """Return the data at `path` as a document of its own, with the same file and lines."""
-    inside, data = len(path), functools.reduce(lambda data, key: data[key], path, document.data)
-    lines = {
-        place[inside:]: line for place, line in document.lines.items() if place[:inside] == path
-    }
+    data = document.data
+    for key in path:
+        data = data[key]
+    depth = len(path)
+    lines = {}
+    for place, line in document.lines.items():
+        if place[:depth] == path:
+            lines[place[depth:]] = line
     return Document(data, document.file, lines)
 
 

@@ -24,7 +24,7 @@ from vkc_pin.world.files.fields import (
 )
 from vkc_pin.world.models.robot import Base
 
-_MAX_OBSTACLES = 10_000  # which take some seconds to load
+_MAX_OBSTACLES = 10_000  # they take some seconds to load
 
 COLOURS: dict[str, tuple[float, float, float]] = {
     "black": (0.13, 0.13, 0.14),
@@ -61,11 +61,8 @@ def _parse_colour(value: Any) -> Any:
 
 
 def _parse_scale(value: Any) -> Any:
-    return (
-        (value, value, value)
-        if isinstance(value, int | float) and not isinstance(value, bool)
-        else value
-    )
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return (value, value, value) if is_number else value
 
 
 def _parse_arm(value: Any) -> Any:
@@ -125,7 +122,9 @@ class PoseSchema(Schema):
 
     @model_validator(mode="after")
     def _check_orientation(self) -> PoseSchema:
-        if sum(given is not None for given in (self.rpy, self.yaw, self.quaternion)) > 1:
+        orientations = (self.rpy, self.yaw, self.quaternion)
+        stated = [orientation for orientation in orientations if orientation is not None]
+        if len(stated) > 1:
             raise make_validation_error(
                 "more than one orientation", "one of rpy, yaw and quaternion"
             )
@@ -290,9 +289,9 @@ class AllowSchema(Schema):
 
     @model_validator(mode="after")
     def _check_pair_or_srdf(self) -> AllowSchema:
-        if (self.pair is None) == (self.srdf is None) or (
-            self.srdf is not None and self.margin is not None
-        ):
+        has_one = (self.pair is None) != (self.srdf is None)
+        has_margin_of_srdf = self.srdf is not None and self.margin is not None
+        if not has_one or has_margin_of_srdf:
             raise make_validation_error(
                 "neither a pair nor an SRDF file",
                 "[one, other], {pair: [one, other], margin: 0.005}, or the name of an SRDF file",

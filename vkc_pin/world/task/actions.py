@@ -25,16 +25,20 @@ def group_into_actions(steps: Sequence[Step]) -> list[tuple[Step, ...]]:
     """
     actions: list[tuple[Step, ...]] = []
     for step in steps:
-        last = actions[-1] if actions else ()
-        grasp = last[-1] if last and isinstance(last[-1], Grasp) else None
-        moves_grasped = (
-            grasp is not None and isinstance(step, Actuate | Place) and step.object == grasp.object
-        )
-        if last and (moves_grasped or isinstance(step, Release)):
-            actions[-1] = (*last, step)
+        if actions and _belongs_to(step, actions[-1][-1]):
+            actions[-1] = (*actions[-1], step)
         else:
             actions.append((step,))
     return actions
+
+
+def _belongs_to(step: Step, before: Step) -> bool:
+    """Return whether a step belongs to the action of the step before."""
+    if isinstance(step, Release):
+        return True
+    if isinstance(before, Grasp) and isinstance(step, Actuate | Place):
+        return step.object == before.object
+    return False
 
 
 def generate_alternatives(task: Task) -> Iterator[tuple[str, tuple[Step, ...]]]:
@@ -69,13 +73,17 @@ def generate_regrasps(
     """
     (step,) = task.steps
     name = get_grasped_object(step)
-    hold = next((one for one in task.phases[0].held if one.object == name), None)
-    if hold is None or hold.by is not None:
+    holds = [hold for hold in task.phases[0].held if hold.object == name]
+    if not holds:
+        return
+    hold = holds[0]
+    if hold.by is not None:
         return
     placed = scene.objects[hold.object]
     if placed.object.free and not find_supports(placed, _list_resting_shapes(scene)):
         return
-    release, again = Release(hold.object), _name_attachment(step, hold.attachment)
+    release = Release(hold.object)
+    again = _name_attachment(step, hold.attachment)
     yield f"{hold.object}.{hold.attachment}, grasped again", (release, again)
     if hold.object not in named:
         yield from generate_alternatives(compile_task(scene, (release, step), options))
@@ -97,9 +105,12 @@ def _name_attachment(step: Step, name: str) -> Step:
 
 def _list_resting_shapes(scene: Scene) -> list[tuple[str, pin.GeometryObject]]:
     """Return label and shape of all objects and obstacles in the scene that are not held."""
-    others = [(name, other) for name, other in scene.objects.items() if name not in scene.held]
-    shapes = [(name, shape) for name, other in others for shape in make_world_shapes(other)]
-    return [*shapes, *zip(scene.obstacle_labels, scene.obstacles, strict=True)]
+    shapes = list[tuple[str, pin.GeometryObject]]()
+    for name, placed in scene.objects.items():
+        if name not in scene.held:
+            shapes += [(name, shape) for shape in make_world_shapes(placed)]
+    shapes += zip(scene.obstacle_labels, scene.obstacles, strict=True)
+    return shapes
 
 
 def compile_each_step(scene: Scene, steps: Sequence[Step], options: Options) -> list[Task]:
@@ -112,8 +123,9 @@ def compile_each_step(scene: Scene, steps: Sequence[Step], options: Options) -> 
     """
     tasks: list[Task] = []
     for number, step in enumerate(as_steps(steps)):
-        tasks.append(compile_task(scene, [step], options, nothing=True, first=number))
-        scene = _predict_scene_after(scene, tasks[-1])
+        task = compile_task(scene, [step], options, nothing=True, first=number)
+        tasks.append(task)
+        scene = _predict_scene_after(scene, task)
     if not any(task.phases for task in tasks):
         raise make_nothing_to_do_error()
     return tasks
@@ -130,9 +142,8 @@ def _predict_scene_after(scene: Scene, task: Task) -> Scene:
             name, _, joint = coordinate.partition(".")
             item = scene.objects[name].object
             index = item.coordinates.index(joint)
-            scene = scene.with_state(
-                name, {joint: float(np.clip(value, item.lower[index], item.upper[index]))}
-            )
+            reached = float(np.clip(value, item.lower[index], item.upper[index]))
+            scene = scene.with_state(name, {joint: reached})
         for hold, placement in phase.lowered.items():
             scene = scene.with_placement(hold.object, placement)
     return scene.with_held(task.after)

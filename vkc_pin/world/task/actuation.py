@@ -13,7 +13,7 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.models.articulated_object import Attachment, Latch
+from vkc_pin.world.models.articulated_object import Attachment, Freedom, Latch
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
@@ -34,33 +34,31 @@ def compute_advance(
 ) -> tuple[float, float]:
     """Return the smallest and largest advance of the contact into its face per unit of a joint.
 
-    The unit is [m/rad], or 1 for a prismatic joint. The velocity of the link is linear in the
-    position of the contact, so a region of slides has its extremes at the corners.
+    The unit is [m/rad], or 1 for a prismatic joint. At unit velocity of the joint, the link's frame
+    has the velocity v and the angular velocity ω, and its point p the velocity v + ω × p. With the
+    inward normal n, the advance is n · (v + ω × p). It is linear in p, so a region of slides has
+    its extremes at the corners.
     """
-    model, data = placed.object.model, placed.object.model.createData()
-    frame, index = placed.object.link_frame(attachment.link), model.getJointId(joint)
+    model = placed.object.model
+    data = model.createData()
+    frame = placed.object.link_frame(attachment.link)
+    index = model.getJointId(joint)
     q = placed.object.coordinates.q(placed.state)
     # Pinocchio returns a vector for a single joint.
     jacobian = pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL).reshape(6, -1)
-    column = jacobian[:, model.joints[index].idx_v]
-    into = attachment.placement.rotation[:, 2]
-    found = [
-        into @ (column[:3] + np.cross(column[3:], point))
-        for point in _sample_contact_region(attachment)
-    ]
-    return float(min(found)), float(max(found))
+    twist = jacobian[:, model.joints[index].idx_v]
+    velocity = twist[:3]
+    angular_velocity = twist[3:]
+    normal = attachment.placement.rotation[:, 2]
+    advances = list[float]()
+    for point in _sample_contact_region(attachment):
+        advances.append(normal @ (velocity + np.cross(angular_velocity, point)))
+    return float(min(advances)), float(max(advances))
 
 
 def _sample_contact_region(attachment: Attachment) -> list[Floats]:
     """Return points of the contact region, including its corners, in the link's frame."""
-    ranges = [
-        np.linspace(
-            own.lower,
-            own.upper,
-            2 if own.kind == "prismatic" else _SAMPLES if own.through.any() else 1,
-        )
-        for own in attachment.freedoms
-    ]
+    ranges = [_sample_freedom(freedom) for freedom in attachment.freedoms]
     points = []
     for values in product(*ranges):
         moved = attachment.placement
@@ -68,6 +66,15 @@ def _sample_contact_region(attachment: Attachment) -> list[Floats]:
             moved = moved * freedom.motion(float(value))
         points.append(moved.translation)
     return points
+
+
+def _sample_freedom(freedom: Freedom) -> Floats:
+    """Return the values of a freedom at which the contact region is sampled, [m] or [rad]."""
+    if freedom.kind == "prismatic":
+        return np.linspace(freedom.lower, freedom.upper, 2)
+    # A rotation about the contact itself does not move it.
+    count = _SAMPLES if freedom.through.any() else 1
+    return np.linspace(freedom.lower, freedom.upper, count)
 
 
 def find_push_directions(
@@ -80,47 +87,53 @@ def find_push_directions(
     """Return the direction in which a push moves each coordinate, 1 or -1; empty for a grasp."""
     if attachment.contact != "push":
         return {}
-    own = {
-        name.partition(".")[2]: value
-        for name, value in state.items()
-        if name.partition(".")[0] == placed.name
-    }
-    placed, directions = placed.with_state(own), dict[str, int]()
-    at = f"'{placed.name}' at '{attachment.name}'"
+    own_values = dict[str, float]()
+    for name, value in state.items():
+        owner, _, joint = name.partition(".")
+        if owner == placed.name:
+            own_values[joint] = value
+    placed = placed.with_state(own_values)
+    directions = dict[str, int]()
+    push = f"pushing '{placed.name}' at '{attachment.name}'"
     for coordinate, value in values.items():
-        joint = coordinate.partition(".")[2]
+        _, _, joint = coordinate.partition(".")
         least, most = compute_advance(placed, attachment, joint)
-        if least * most <= 0.0 or min(abs(least), abs(most)) < _MIN_ADVANCE:
-            problem = f"pushing {at} does not move '{joint}' in a single direction"
+        smallest = min(abs(least), abs(most))
+        if least * most <= 0.0 or smallest < _MIN_ADVANCE:
             raise InputError(
-                problem,
+                f"{push} does not move '{joint}' in a single direction",
                 field=where,
                 expected="a face that lies entirely on one side of the joint's axis",
             )
-        directions[coordinate] = direction = 1 if least > 0.0 else -1
+        direction = 1 if least > 0.0 else -1
+        directions[coordinate] = direction
         begin = state[coordinate]
         lower, upper = find_joint_limits(placed, coordinate)
-        if (min(max(value, lower), upper) - begin) * direction < 0.0:
+        goal = min(max(value, lower), upper)
+        if (goal - begin) * direction < 0.0:
             only = "up" if direction > 0 else "down"
-            problem = f"pushing {at} moves '{joint}' {only} only: a hand that pushes cannot pull"
-            other = [
-                name for name, one in placed.object.attachments.items() if one.contact != "push"
-            ]
-            expected = f"{'≥' if direction > 0 else '≤'} {begin:g}"
-            expected += (
-                f", or an attachment that can be grasped: {', '.join(other)}" if other else ""
+            bound = "≥" if direction > 0 else "≤"
+            expected = f"{bound} {begin:g}"
+            attachments = placed.object.attachments
+            others = [name for name, one in attachments.items() if one.contact != "push"]
+            if others:
+                expected += f", or an attachment that can be grasped: {', '.join(others)}"
+            raise InputError(
+                f"{push} moves '{joint}' {only} only: a hand that pushes cannot pull",
+                field=where,
+                expected=expected,
+                got=value,
             )
-            raise InputError(problem, field=where, expected=expected, got=value)
     return directions
 
 
 def find_blocking_latches(
     placed: PlacedObject, state: Mapping[str, float], values: Mapping[str, float]
 ) -> Iterator[Latch]:
-    """Yield the latches of an object that block joints which are to move, now or on the way.
+    """Yield the latches of an object that block joints which are to move, now or on their path.
 
-    Entries that the caller adds to `values` meanwhile count, since what releases a latch may itself
-    be latched.
+    Entries that the caller adds to `values` meanwhile count, since the joint that releases a latch
+    may itself be latched.
 
     Args:
         placed: Object.
@@ -141,7 +154,8 @@ def find_closing_latches(
     """Yield the latches that begin to act when joints move; see `find_blocking_latches`."""
     for latch in placed.object.latches:
         now, goal = _find_motion(placed, latch.joint, state, values)
-        is_released = min(_find_motion(placed, latch.released_by, state, values)) >= latch.threshold
+        release = _find_motion(placed, latch.released_by, state, values)
+        is_released = min(release) >= latch.threshold
         if latch.is_engaged(goal) and not latch.is_engaged(now) and not is_released:
             yield latch
 
@@ -151,7 +165,8 @@ def _find_motion(
 ) -> tuple[float, float]:
     """Return the initial and the final value of a joint, [rad] or [m]."""
     name = f"{placed.name}.{joint}"
-    now = state.get(name, float(placed.state[placed.object.coordinates.index(joint)]))
+    in_scene = float(placed.state[placed.object.coordinates.index(joint)])
+    now = state.get(name, in_scene)
     return now, values.get(name, now)
 
 
@@ -163,65 +178,74 @@ def check_actuation(
     where: str,
 ) -> None:
     """Check that a hand at an attachment can bring joints to values."""
-    name, path = placed.name, find_path_joints(placed, attachment)
-    for joint in (coordinate.partition(".")[2] for coordinate in values):
+    name = placed.name
+    path = find_path_joints(placed, attachment)
+    for coordinate in values:
+        _, _, joint = coordinate.partition(".")
         if joint not in path:
             problem = f"joint '{joint}' does not move when '{name}' is held at '{attachment.name}'"
             expected = f"one of {', '.join(path)}" if path else "an attachment that moves with it"
             raise InputError(problem, field=f"{where}.joints", expected=expected)
-    joints = zip(placed.object.coordinates.names, placed.state.tolist(), strict=True)
-    state = {f"{name}.{joint}": value for joint, value in joints} | dict(state)
+    full_state = dict[str, float]()
+    for joint, value in zip(placed.object.coordinates.names, placed.state.tolist(), strict=True):
+        full_state[f"{name}.{joint}"] = value
+    full_state.update(state)
     wanted = dict(values)
-    for latch in find_blocking_latches(placed, state, wanted):
+    for latch in find_blocking_latches(placed, full_state, wanted):
         release = f"{name}.{latch.released_by}"
         if latch.released_by in path:
-            wanted.setdefault(release, max(latch.threshold, state[release]))
-        elif state[release] < latch.threshold:
-            problem = f"'{latch.joint}' is latched, and '{latch.released_by}', which releases it, "
-            problem += f"does not move when '{name}' is held at '{attachment.name}'"
+            wanted.setdefault(release, max(latch.threshold, full_state[release]))
+        elif full_state[release] < latch.threshold:
             raise InputError(
-                problem,
+                f"'{latch.joint}' is latched, and '{latch.released_by}', which releases it, does "
+                f"not move when '{name}' is held at '{attachment.name}'",
                 field=f"{where}.attachment",
                 expected=f"an attachment that moves '{latch.released_by}'",
             )
-    find_push_directions(placed, attachment, state, values, f"{where}.joints")
+    find_push_directions(placed, attachment, full_state, values, f"{where}.joints")
 
 
 def find_driving_attachments(
     placed: PlacedObject, state: Mapping[str, float], values: Mapping[str, float], where: str
 ) -> list[str]:
     """Return the attachments at which a hand can bring joints to values, in the object's order."""
-    found, errors = list[str](), list[InputError]()
+    found = list[str]()
+    errors = dict[str, InputError]()
     for name, attachment in placed.object.attachments.items():
         try:
             check_actuation(placed, attachment, state, values, where)
         except InputError as error:
-            errors.append(error)
+            errors[name] = error
         else:
             found.append(name)
-    if not found and len(errors) == 1:
-        raise errors[0]
-    if not found:
-        requested = " and ".join(f"'{coordinate.partition('.')[2]}'" for coordinate in values)
-        moved = {
-            name: ", ".join(find_path_joints(placed, one)) or "nothing"
-            for name, one in placed.object.attachments.items()
-        }
-        problem = f"no attachment of '{placed.name}' can bring {requested} there"
-        if all(error.problem.startswith("joint ") for error in errors):
-            expected = "joints that one attachment moves: "
-            expected += "; ".join(f"{name} moves {path}" for name, path in moved.items())
-        else:
-            expected = "one that can; " + "; ".join(
-                f"{name}: {error.problem}" for name, error in zip(moved, errors, strict=True)
-            )
-        raise InputError(
-            problem,
-            field=f"{where}.joints",
-            expected=expected,
-            got=", ".join(map(str, values.values())),
-        )
-    return found
+    if found:
+        return found
+    if len(errors) == 1:
+        raise next(iter(errors.values()))
+    raise _make_actuation_error(placed, errors, values, where)
+
+
+def _make_actuation_error(
+    placed: PlacedObject, errors: Mapping[str, InputError], values: Mapping[str, float], where: str
+) -> InputError:
+    """Return the error for joints that a hand cannot move at any attachment, given its errors."""
+    requested = [f"'{coordinate.partition('.')[2]}'" for coordinate in values]
+    reasons = list[str]()
+    if all(error.problem.startswith("joint ") for error in errors.values()):
+        expected = "joints that one attachment moves: "
+        for name, attachment in placed.object.attachments.items():
+            path = ", ".join(find_path_joints(placed, attachment)) or "nothing"
+            reasons.append(f"{name} moves {path}")
+    else:
+        expected = "one that can; "
+        for name, error in errors.items():
+            reasons.append(f"{name}: {error.problem}")
+    return InputError(
+        f"no attachment of '{placed.name}' can bring {' and '.join(requested)} there",
+        field=f"{where}.joints",
+        expected=expected + "; ".join(reasons),
+        got=", ".join(map(str, values.values())),
+    )
 
 
 def list_driving_attachments(
@@ -242,16 +266,15 @@ def list_driving_attachments(
         return [named]
     check_graspable(placed, f"{where}.attachment")
     fit = find_driving_attachments(placed, state, values, where)
-    return list(dict.fromkeys([*(name for name in used if name in fit), *fit]))
+    preferred = [name for name in used if name in fit]
+    return list(dict.fromkeys([*preferred, *fit]))
 
 
 def find_driven_coordinates(scene: Scene, hold: Hold) -> list[str]:
     """Return the coordinates "<object>.<joint>" that a hold can move, base first."""
     placed = scene.objects[hold.object]
-    return [
-        f"{placed.name}.{joint}"
-        for joint in find_path_joints(placed, placed.object.attachments[hold.attachment])
-    ]
+    path = find_path_joints(placed, placed.object.attachments[hold.attachment])
+    return [f"{placed.name}.{joint}" for joint in path]
 
 
 def find_shared_coordinate(scene: Scene, holds: Iterable[Hold]) -> str | None:
@@ -264,7 +287,8 @@ def find_shared_coordinate(scene: Scene, holds: Iterable[Hold]) -> str | None:
         attachment = scene.objects[hold.object].object.attachments[hold.attachment]
         freedoms = [f"{hold.object}.{name}" for name in attachment.coordinates]
         own = [*find_driven_coordinates(scene, hold), *freedoms]
-        if not driven.isdisjoint(own):
-            return next(name for name in own if name in driven)
+        for name in own:
+            if name in driven:
+                return name
         driven.update(own)
     return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -74,17 +74,17 @@ class _Compiler:
     """
 
     def __init__(self, scene: Scene, options: Options) -> None:
-        self.scene, self.options = scene, options
+        self.scene = scene
+        self.options = options
         self.phases: list[Phase] = []
         self.held: tuple[Hold, ...] = scene.holds
         self.holds: list[Hold] = list(self.held)
         self.initial: dict[str, float] = {}
         self.state: dict[str, float] = {}
-        self.resting = {
-            n: p.placement
-            for n, p in scene.objects.items()
-            if p.object.free and n not in scene.held
-        }
+        self.resting: dict[str, pin.SE3] = {}
+        for name, placed in scene.objects.items():
+            if placed.object.free and name not in scene.held:
+                self.resting[name] = placed.placement
         self.released_by: dict[str, tuple[Hold, int]] = {}
         self.step = 0
         self.open: dict[Hold, OpenAttachment] = {}
@@ -109,9 +109,8 @@ class _Compiler:
         ranges: Mapping[str, tuple[float, float]],
     ) -> None:
         """Add a phase that moves joints of a fixed object, with all objects that rest on it."""
-        self.supports.begin_motion(
-            hold, {coordinate.partition(".")[2] for coordinate in ranges}, self.state, where
-        )
+        joints = {coordinate.partition(".")[2] for coordinate in ranges}
+        self.supports.begin_motion(hold, joints, self.state, where)
         segments = self.options.move_waypoints if kind == "move" else self.options.turn_waypoints
         placed = self.scene.objects[hold.object]
         grasp = placed.object.attachments[hold.attachment]
@@ -122,41 +121,43 @@ class _Compiler:
     def _append(
         self, kind: PhaseKind, about: tuple[str, ...], segments: int, **details: Any
     ) -> None:
-        last = self.phases[-1] if self.phases else None
-        before = (*last.held, *last.grasps) if last else self.scene.holds
-        released = tuple(hold for hold in before if hold not in self.held)
-        lifted = (
-            {hold: last.resting[hold.object] for hold in last.grasps if hold.object in last.resting}
-            if last
-            else {}
-        )
+        """Add a phase to the state of the task, and bring the state to the end of the phase."""
+        before = self.scene.holds
+        lifted = dict[Hold, pin.SE3]()  # free objects that the last phase grasped
+        if self.phases:
+            last = self.phases[-1]
+            before = (*last.held, *last.grasps)
+            for hold in last.grasps:
+                if hold.object in last.resting and hold in self.held:
+                    lifted[hold] = last.resting[hold.object]
+        released_by = dict(self.released_by)
+        for name in self.supports.moved:
+            released_by.pop(name, None)
         phase = Phase(
             kind,
             about,
             segments,
             held=self.held,
-            released=released,
+            released=tuple(hold for hold in before if hold not in self.held),
             initial_values=dict(self.state),
             resting=dict(self.resting),
-            released_by={
-                name: how
-                for name, how in self.released_by.items()
-                if name not in self.supports.moved
-            },
-            lifted={hold: where for hold, where in lifted.items() if hold in self.held},
+            released_by=released_by,
+            lifted=lifted,
             supported=self.supports.supported,
             **details,
         )
         self.phases.append(phase)
         # A goal beyond a limit is approached as far as the limit.
         for coordinate, value in phase.values.items():
-            lower, upper = find_joint_limits(
-                self.scene.objects[coordinate.split(".", 1)[0]], coordinate
-            )
+            name, _, _ = coordinate.partition(".")
+            lower, upper = find_joint_limits(self.scene.objects[name], coordinate)
             self.state[coordinate] = min(max(value, lower), upper)
 
     def _find_hold(self, name: str) -> Hold | None:
-        return next((hold for hold in self.held if hold.object == name), None)
+        for hold in self.held:
+            if hold.object == name:
+                return hold
+        return None
 
     def _release_fixed_objects(self) -> None:
         """Release all fixed objects, which the robot cannot carry along."""
@@ -171,9 +172,12 @@ class _Compiler:
             named = find_attachment(placed, attachment_name, f"{where}.attachment")
             return self._grasp_at([named.name], placed, where, by)
         fit = list_graspable_attachments(placed, by, f"{where}.attachment")
-        known = (*self.held, *self.holds)
-        used = [hold.attachment for hold in known if (hold.object, hold.frame) == (name, by)]
-        return self._grasp_at(list(dict.fromkeys([*used[:1], *fit])), placed, where, by)
+        # The attachment at which the task has grasped the object already is preferred.
+        for hold in (*self.held, *self.holds):
+            if hold.object == name and hold.frame == by:
+                fit = list(dict.fromkeys([hold.attachment, *fit]))
+                break
+        return self._grasp_at(fit, placed, where, by)
 
     def _grasp_at(
         self, attachments: Sequence[str], placed: PlacedObject, where: str, by: str | None = None
@@ -183,44 +187,19 @@ class _Compiler:
         An attachment that an earlier step has chosen is kept.
         """
         name = placed.name
-        through = self._find_holder(by, name, f"{where}.by") if by is not None else None
-        hold = Hold(name, attachments[0], *(through or (None, None)))
-        same = next((one for one in self.held if one.nominal == hold.nominal), None)
-        if same is not None:
-            if same in self.open:
-                kept = [other for other in self.open[same].others if other in attachments]
-                self.open[same] = replace(self.open[same], others=tuple(kept))
-            return same
-        if (held := self._find_hold(name)) is not None and placed.object.free:
-            raise InputError(
-                f"'{name}' is held already, as {held}",
-                field=where,
-                expected="Release or Place before",
-            )
-        if through is None:
-            self._release_fixed_objects()
-            if self.held:
-                kind = "the robot has one hand, and it holds"
-                raise InputError(
-                    f"{kind} {self.held[0]}",
-                    field=f"{where}.object",
-                    expected="Place or Release before",
-                    got=name,
-                )
-        if not placed.object.free and through is not None:
-            raise InputError(
-                f"'{name}' is fixed in the world",
-                field=f"{where}.by",
-                expected="the hand itself",
-                got=format_value(by),
-            )
-        if name in self.released_by:
-            problem = f"the placement of '{name}' at this step is known only after planning"
-            expected = "Place with a full pose before, or a second plan from where the first ends"
-            raise InputError(problem, field=f"{where}.object", expected=expected)
-        if any(one.object == name for one in self.supports.carried):
-            problem = f"'{name}' rests on an object that the robot carries"
-            raise InputError(problem, field=f"{where}.object", expected="Place or Release before")
+        if by is None:
+            hold = Hold(name, attachments[0])
+        else:
+            carrier, link = self._find_holder(by, name, f"{where}.by")
+            hold = Hold(name, attachments[0], carrier, link)
+        for same in self.held:
+            if same.nominal == hold.nominal:
+                if same in self.open:
+                    open_attachment = self.open[same]
+                    others = [other for other in open_attachment.others if other in attachments]
+                    self.open[same] = replace(open_attachment, others=tuple(others))
+                return same
+        self._prepare_grasp(placed, by, where)
         if not any(hold in phase.grasps for phase in self.phases):
             others = [other for other in placed.object.attachments if other in attachments[1:]]
             self.open[hold] = OpenAttachment(self.step, name, tuple(others))
@@ -235,25 +214,64 @@ class _Compiler:
         self.resting.pop(name, None)
         return hold
 
+    def _prepare_grasp(self, placed: PlacedObject, by: str | None, where: str) -> None:
+        """Check that an object can be grasped now, after the hand has released fixed objects.
+
+        A held object that grasps, `by`, leaves the other holds as they are.
+        """
+        name = placed.name
+        held = self._find_hold(name)
+        if held is not None and placed.object.free:
+            raise InputError(
+                f"'{name}' is held already, as {held}",
+                field=where,
+                expected="Release or Place before",
+            )
+        if by is None:
+            self._release_fixed_objects()
+            if self.held:
+                raise InputError(
+                    f"the robot has one hand, and it holds {self.held[0]}",
+                    field=f"{where}.object",
+                    expected="Place or Release before",
+                    got=name,
+                )
+        elif not placed.object.free:
+            raise InputError(
+                f"'{name}' is fixed in the world",
+                field=f"{where}.by",
+                expected="the hand itself",
+                got=format_value(by),
+            )
+        if name in self.released_by:
+            problem = f"the placement of '{name}' at this step is known only after planning"
+            expected = "Place with a full pose before, or a second plan from where the first ends"
+            raise InputError(problem, field=f"{where}.object", expected=expected)
+        if any(one.object == name for one in self.supports.carried):
+            problem = f"'{name}' rests on an object that the robot carries"
+            raise InputError(problem, field=f"{where}.object", expected="Place or Release before")
+
     def _drop_unused_holds(self, hold: Hold) -> None:
         """Drop holds of the start that no phase uses and that move the joints of a new hold.
 
         A kinematic chain can contain these joints only once.
         """
-        used = {*self.held, *(one for phase in self.phases for one in (*phase.held, *phase.grasps))}
-        used_holds = [
-            one
-            for one in self.holds
-            if one in used or find_shared_coordinate(self.scene, (one, hold)) is None
-        ]
-        if len(used_holds) < len(self.holds):
-            self.holds = used_holds
-            remaining = {
-                name for one in used_holds for name in find_driven_coordinates(self.scene, one)
-            }
-            for values in (self.initial, self.state):
-                for name in values.keys() - remaining:
-                    del values[name]
+        used = {*self.held}
+        for phase in self.phases:
+            used.update(phase.held, phase.grasps)
+        remaining = list[Hold]()
+        for one in self.holds:
+            if one in used or find_shared_coordinate(self.scene, (one, hold)) is None:
+                remaining.append(one)
+        if len(remaining) == len(self.holds):
+            return
+        self.holds = remaining
+        coordinates = set[str]()
+        for one in remaining:
+            coordinates.update(find_driven_coordinates(self.scene, one))
+        for values in (self.initial, self.state):
+            for name in values.keys() - coordinates:
+                del values[name]
 
     def _find_holder(self, frame: str, name: str, where: str) -> tuple[Hold, str]:
         """Return hold and link of `frame`, "<object>.<link>", which is to hold `name`."""
@@ -268,23 +286,19 @@ class _Compiler:
         placed = find_object(self.scene, owner, where)
         hold = self._find_hold(owner)
         if hold is None or not placed.object.free:
-            held = (
-                ", ".join(str(h) for h in self.held if self.scene.objects[h.object].object.free)
-                or "nothing"
-            )
-            problem = (
-                f"'{name}' cannot be grasped through '{owner}', which the robot does not carry"
-            )
+            objects = self.scene.objects
+            carried = [str(one) for one in self.held if objects[one.object].object.free]
             raise InputError(
-                problem,
+                f"'{name}' cannot be grasped through '{owner}', which the robot does not carry",
                 field=where,
-                expected=f"a link of what it carries ({held})",
+                expected=f"a link of what it carries ({', '.join(carried) or 'nothing'})",
                 got=format_value(frame),
             )
         check_link(placed, link, where)
         return hold, link
 
     def actuate(self, step: Actuate, where: str) -> None:
+        """Add the phases that grasp an object, release its latches and bring joints to values."""
         placed = find_object(self.scene, step.object, f"{where}.object")
         if placed.object.free:
             problem = f"'{step.object}' is a free object: a hand cannot drive its joints"
@@ -296,11 +310,8 @@ class _Compiler:
                     f"joint of '{step.object}'", joint, names, field=f"{where}.joints"
                 )
         values = {f"{step.object}.{joint}": value for joint, value in step.joints.items()}
-        used = [
-            one.attachment
-            for one in (*self.held, *reversed(self.holds))
-            if one.object == step.object
-        ]
+        latest_first = (*self.held, *reversed(self.holds))
+        used = [one.attachment for one in latest_first if one.object == step.object]
         fit = list_driving_attachments(placed, step.attachment, used, self.state, values, where)
         hold = self._grasp_at(fit, placed, where)
         ranges = {coordinate: find_joint_limits(placed, coordinate) for coordinate in values}
@@ -308,31 +319,47 @@ class _Compiler:
         after: dict[str, float] = {}
         for latch in find_blocking_latches(placed, self.state, values):
             release = f"{step.object}.{latch.released_by}"
-            if latch.released_by not in path:  # and it is past the threshold
+            # A joint that the hand does not move is past the threshold: the grasp was checked.
+            if latch.released_by not in path:
                 continue
             lower, upper = find_joint_limits(placed, release)
             turned = min(latch.threshold + LATCH_MARGIN, upper)
             if self.state[release] < turned:
-                self._append_motion(
-                    "turn", hold, where, {release: turned}, {release: (lower, upper)}
-                )
-            if values.get(release, upper) < turned:  # must wait until the latch has disengaged
+                turn_ranges = {release: (lower, upper)}
+                self._append_motion("turn", hold, where, {release: turned}, turn_ranges)
+            # A value below the threshold must wait until the latch has disengaged.
+            if values.get(release, upper) < turned:
                 after[release] = values[release]
-            ranges[release] = (turned, upper)
-            values[release] = turned if release in after else values.get(release, turned)
-        # Once a joint is in the range of its latch, it can only move on to the latched position.
-        for latch in find_closing_latches(placed, self.state, values):
-            name = f"{step.object}.{latch.joint}"
-            (lower, upper), distance = ranges[name], self.state[name] - latch.held_at
-            away = min(abs(distance), latch.engaged_within + LATCH_GAP)
-            if distance > 0.0:
-                ranges[name] = max(lower, latch.held_at + away), upper
+            if release in after:
+                values[release] = turned
             else:
-                ranges[name] = lower, min(upper, latch.held_at - away)
+                values.setdefault(release, turned)
+            ranges[release] = (turned, upper)
+        self._keep_out_of_latches(placed, values, ranges)
         self._append_motion("move", hold, where, values, ranges)
         if after:
             limits = {release: find_joint_limits(placed, release) for release in after}
             self._append_motion("turn", hold, where, after, limits)
+
+    def _keep_out_of_latches(
+        self,
+        placed: PlacedObject,
+        values: Mapping[str, float],
+        ranges: dict[str, tuple[float, float]],
+    ) -> None:
+        """Limit the ranges of joints that move into their latches to the side they are on.
+
+        Once a joint is in the range of its latch, it can only move on to the latched position.
+        """
+        for latch in find_closing_latches(placed, self.state, values):
+            name = f"{placed.name}.{latch.joint}"
+            lower, upper = ranges[name]
+            distance = self.state[name] - latch.held_at
+            gap = min(abs(distance), latch.engaged_within + LATCH_GAP)
+            if distance > 0.0:
+                ranges[name] = (max(lower, latch.held_at + gap), upper)
+            else:
+                ranges[name] = (lower, min(upper, latch.held_at - gap))
 
     def touch(self, step: Touch, where: str) -> None:
         """Add the phase that brings a frame to its target; free held objects are carried along."""
@@ -349,22 +376,30 @@ class _Compiler:
         elif dot and step.frame not in self.scene.robot.frame_names:
             raise UnknownNameError("object", owner, self.scene.objects, field=f"{where}.frame")
         elif owner in self.scene.objects and owner not in self.scene.robot.frame_names:
-            links = self.scene.objects[owner].object.links
-            expected = f"one of {', '.join(f'{owner}.{name}' for name in links)}"
-            problem = "this is an object, not one of its links"
-            raise InputError(problem, field=f"{where}.frame", expected=expected, got=owner)
+            labels = [f"{owner}.{name}" for name in self.scene.objects[owner].object.links]
+            raise InputError(
+                "this is an object, not one of its links",
+                field=f"{where}.frame",
+                expected=f"one of {', '.join(labels)}",
+                got=owner,
+            )
         else:
             link = find_robot_frame(self.scene, step.frame, f"{where}.frame")
         if hold is None and step.attachment is not None:
-            problem = f"'{step.frame}' is no link of an object that can be grasped"
-            field, got = f"{where}.attachment", step.attachment
-            raise InputError(problem, field=field, expected="no attachment", got=got)
+            raise InputError(
+                f"'{step.frame}' is no link of an object that can be grasped",
+                field=f"{where}.attachment",
+                expected="no attachment",
+                got=step.attachment,
+            )
         self._release_fixed_objects()
-        point = not isinstance(step.target, pin.SE3)
-        target = pin.SE3(np.eye(3), np.array(step.target)) if point else step.target
-        if hold is not None and not point:
-            self._check_level(hold, link, target, f"{where}.target")
-        goal = FrameGoal(link, target, "point" if point else "pose", hold, touches=True)
+        if isinstance(step.target, pin.SE3):
+            if hold is not None:
+                self._check_level(hold, link, step.target, f"{where}.target")
+            goal = FrameGoal(link, step.target, "pose", hold, touches=True)
+        else:
+            point = pin.SE3(np.eye(3), np.array(step.target))
+            goal = FrameGoal(link, point, "point", hold, touches=True)
         self._append("touch", (step.frame,), self.options.reach_waypoints, frames=(goal,))
 
     def place(self, step: Place, where: str) -> None:
@@ -374,23 +409,29 @@ class _Compiler:
             problem = f"'{step.object}' is fixed in the world"
             raise InputError(problem, field=f"{where}.object", expected="a free object")
         hold = self._find_or_grasp(step.object, step.attachment, where)
-        upright = not isinstance(step.pose, pin.SE3)
-        # As it rests now; an object held from the start, with its z axis up.
-        rotation = np.eye(3) if step.object in self.scene.held else placed.placement.rotation
-        pose = pin.SE3(rotation, np.array(step.pose)) if upright else step.pose
+        has_pose = isinstance(step.pose, pin.SE3)
+        if has_pose:
+            pose = step.pose
+        else:
+            # As it rests now; an object held from the start, with its z axis up.
+            rotation = np.eye(3) if step.object in self.scene.held else placed.placement.rotation
+            pose = pin.SE3(rotation, np.array(step.pose))
         self._check_level(hold, placed.object.base_link, pose, f"{where}.pose")
-        goal = FrameGoal(placed.object.base_link, pose, "upright" if upright else "pose", hold)
-        about, count = (step.object,), self.options.reach_waypoints
-        self._append("place", about, count, frames=(goal,), lowered={hold: pose})
-        self._release(hold, pose, nearly=upright)
+        goal = FrameGoal(placed.object.base_link, pose, "pose" if has_pose else "upright", hold)
+        segments = self.options.reach_waypoints
+        self._append("place", (step.object,), segments, frames=(goal,), lowered={hold: pose})
+        self._release(hold, pose, nearly=not has_pose)
 
     def _find_or_grasp(self, name: str, attachment: str | None, where: str) -> Hold:
         """Return the present hold of a free object, which is grasped if there is none."""
         hold = self._find_hold(name) or self.grasp(name, attachment, where)
         if attachment not in (None, hold.attachment):
-            field, expected = f"{where}.attachment", hold.attachment
-            problem = "it is held elsewhere"
-            raise InputError(problem, field=field, expected=expected, got=attachment)
+            raise InputError(
+                "it is held elsewhere",
+                field=f"{where}.attachment",
+                expected=hold.attachment,
+                got=attachment,
+            )
         return hold
 
     def _check_level(self, hold: Hold, link: str, goal: pin.SE3, where: str) -> None:
@@ -408,17 +449,18 @@ class _Compiler:
         if step.object is not None and self._find_hold(step.object) is None:
             held = [hold.object for hold in self.held]
             raise UnknownNameError("held object", step.object, held, field=f"{where}.object")
-        released: list[Hold] = []  # with what is held through them, which is released first
+        # Objects held through a released one are released before it.
+        released: list[Hold] = []
         for hold in self.held:
             if step.object in (None, hold.object) or hold.by in released:
                 released.insert(0, hold)
-        if not (has_moved := bool(self.phases)):
-            objects = self.scene.objects
-            lowered = {
-                hold: objects[hold.object].placement
-                for hold in released
-                if objects[hold.object].object.free
-            }
+        has_moved = bool(self.phases)
+        if not has_moved:
+            lowered = dict[Hold, pin.SE3]()
+            for hold in released:
+                placed = self.scene.objects[hold.object]
+                if placed.object.free:
+                    lowered[hold] = placed.placement
             self._append("stand", (), self.options.turn_waypoints, lowered=lowered)
         for hold in released:
             if hold in self.held:
@@ -429,39 +471,59 @@ class _Compiler:
 
         If `nearly`, the motion decides where exactly the object rests.
         """
-        for other in [h for h in self.held if h.by == hold]:
+        through = [other for other in self.held if other.by == hold]
+        for other in through:
             self._release(other, self.scene.objects[other.object].placement)
-        self.held = tuple(h for h in self.held if h != hold)
+        self.held = tuple(other for other in self.held if other != hold)
         if self.scene.objects[hold.object].object.free:
             self.resting[hold.object] = where
             supported = self.supports.release_carried(hold, where)
             if nearly:
-                self.released_by |= dict.fromkeys(
-                    (hold.object, *supported), (hold, len(self.phases) - 1)
-                )
+                for name in (hold.object, *supported):
+                    self.released_by[name] = (hold, len(self.phases) - 1)
 
     def add(self, step: Step, where: str) -> None:
-        own: dict[type, Callable[[Any, str], None]]
-        own = {Actuate: self.actuate, Touch: self.touch, Place: self.place, Release: self.release}
-        if type(step) in own:
-            own[type(step)](step, where)
-        elif isinstance(step, Grasp):
-            self.grasp(step.object, step.attachment, where, step.by)
-        elif isinstance(step, Reach):
-            check_pose_is_unambiguous(self.scene, step, f"{where}.pose")
-            frame = find_robot_frame(self.scene, step.frame, f"{where}.frame")
-            self._release_fixed_objects()
-            goals = (FrameGoal(frame, step.pose),)
-            self._append("reach", (frame,), self.options.reach_waypoints, frames=goals)
-        elif isinstance(step, Configure):
-            configuration = find_configuration(self.scene, step, where)
-            self._release_fixed_objects()
-            self._append("configure", (), self.options.reach_waypoints, configuration=configuration)
-        elif isinstance(step, GoTo):
-            self._release_fixed_objects()
-            base = zip(self.scene.robot.coordinates.names, (step.x, step.y, step.yaw), strict=False)
-            goal = {name: (value, value) for name, value in base if value is not None}
-            self._append("go", (), self.options.reach_waypoints, configuration=goal)
+        """Add the phases of a step; `where` is its field in error messages."""
+        match step:
+            case Actuate():
+                self.actuate(step, where)
+            case Touch():
+                self.touch(step, where)
+            case Place():
+                self.place(step, where)
+            case Release():
+                self.release(step, where)
+            case Grasp():
+                self.grasp(step.object, step.attachment, where, step.by)
+            case Reach():
+                self.reach(step, where)
+            case Configure():
+                self.configure(step, where)
+            case GoTo():
+                self.go(step)
+
+    def reach(self, step: Reach, where: str) -> None:
+        """Add the phase that brings a frame of the robot to a pose."""
+        check_pose_is_unambiguous(self.scene, step, f"{where}.pose")
+        frame = find_robot_frame(self.scene, step.frame, f"{where}.frame")
+        self._release_fixed_objects()
+        goals = (FrameGoal(frame, step.pose),)
+        self._append("reach", (frame,), self.options.reach_waypoints, frames=goals)
+
+    def configure(self, step: Configure, where: str) -> None:
+        """Add the phase that brings joints of the robot to values."""
+        configuration = find_configuration(self.scene, step, where)
+        self._release_fixed_objects()
+        self._append("configure", (), self.options.reach_waypoints, configuration=configuration)
+
+    def go(self, step: GoTo) -> None:
+        """Add the phase that brings the base to a position."""
+        self._release_fixed_objects()
+        x_name, y_name, yaw_name = self.scene.robot.coordinates.names[:3]
+        goal = {x_name: (step.x, step.x), y_name: (step.y, step.y)}
+        if step.yaw is not None:
+            goal[yaw_name] = (step.yaw, step.yaw)
+        self._append("go", (), self.options.reach_waypoints, configuration=goal)
 
 
 def compile_task(
@@ -469,26 +531,44 @@ def compile_task(
 ) -> Task:
     """Compile steps to phases, beginning at the scene's start."""
     steps = as_steps(steps)
-    compiler, marks = _Compiler(scene, options), list[StepBoundary]()
+    compiler = _Compiler(scene, options)
+    boundaries = list[StepBoundary]()
     for index, step in enumerate(steps):
         compiler.step = index
         compiler.add(step, f"steps[{first + index}]")
-        phases, holds = len(compiler.phases), len(compiler.holds)
-        marks.append(StepBoundary(phases, holds, len(compiler.initial), compiler.held))
+        boundary = StepBoundary(
+            len(compiler.phases), len(compiler.holds), len(compiler.initial), compiler.held
+        )
+        boundaries.append(boundary)
     if not compiler.phases and not nothing:
         raise make_nothing_to_do_error()
-    # Objects that are grasped later keep their initial values until then.
-    initial, found = compiler.initial, list[Phase]()
+    initial = compiler.initial
     openings = compute_openings(scene, compiler.phases)
+    phases = list[Phase]()
     for phase, opening in zip(compiler.phases, openings, strict=True):
-        known = {name: value for name, value in phase.initial_values.items() if name in initial}
-        found.append(replace(phase, initial_values={**initial, **known}, opening=opening))
-    every = tuple(compiler.holds)
-    left_open = tuple(one for one in compiler.open.values() if one.others)
-    return Task(steps, tuple(found), every, initial, compiler.held, tuple(marks), left_open)
+        # Objects that are grasped later keep their initial values until then.
+        values = dict(initial)
+        for name, value in phase.initial_values.items():
+            if name in initial:
+                values[name] = value
+        phases.append(replace(phase, initial_values=values, opening=opening))
+    open_attachments = [one for one in compiler.open.values() if one.others]
+    return Task(
+        steps,
+        tuple(phases),
+        tuple(compiler.holds),
+        initial,
+        compiler.held,
+        tuple(boundaries),
+        tuple(open_attachments),
+    )
 
 
 def make_nothing_to_do_error() -> InputError:
     """Return the error for steps that change nothing."""
-    expected, got = "a step that changes something", "only steps that are done already"
-    return InputError("there is nothing to do", field="steps", expected=expected, got=got)
+    return InputError(
+        "there is nothing to do",
+        field="steps",
+        expected="a step that changes something",
+        got="only steps that are done already",
+    )

@@ -40,14 +40,17 @@ def find_configuration(scene: Scene, step: Configure, where: str) -> dict[str, _
         middle = (value - move.offset) / move.factor
         deviation = step.get_tolerance(joint) / abs(move.factor)
         interval = _intersect(scene, name, (middle - deviation, middle + deviation), value, field)
+        low, high = interval
         if name in found:
-            before = found[name]
-            interval = max(interval[0], before[0]), min(interval[1], before[1])
-            if interval[0] > interval[1] + LIMIT_SLACK:
+            low_before, high_before = found[name]
+            low = max(low, low_before)
+            high = min(high, high_before)
+            if low > high + LIMIT_SLACK:
                 problem = f"the coupled joints of '{name}' contradict each other"
-                expected = f"a value with which '{name}' is from {before[0]:g} to {before[1]:g}"
+                expected = f"a value with which '{name}' is from {low_before:g} to {high_before:g}"
                 raise InputError(problem, field=field, expected=expected, got=value)
-        found[name] = min(interval), max(interval)
+        # Rounding may have exchanged the ends.
+        found[name] = (min(low, high), max(low, high))
     return found
 
 
@@ -93,14 +96,17 @@ def _intersect(scene: Scene, name: str, interval: _Interval, value: float, field
     """Return the part of an interval of a coordinate that is within its limits."""
     robot = scene.robot
     column = robot.coordinates.index(name)
-    lower, upper = float(robot.lower[column]), float(robot.upper[column])
+    lower = float(robot.lower[column])
+    upper = float(robot.upper[column])
     limits = "the joint's limits"
     if column < 2:
-        low, high = scene.arena[2 * column : 2 * column + 2]
-        lower, upper = max(lower, float(low)), min(upper, float(high))
+        arena_low, arena_high = scene.arena[2 * column : 2 * column + 2]
+        lower = max(lower, float(arena_low))
+        upper = min(upper, float(arena_high))
         limits = "the arena"
     if column < 3 and robot.base == "fixed":
-        lower = upper = float(scene.start[column])
+        lower = float(scene.start[column])
+        upper = lower
         limits = "the place of the fixed base"
     low, high = interval
     if low > upper + _ROUNDING or high < lower - _ROUNDING:

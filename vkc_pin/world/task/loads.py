@@ -13,7 +13,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.options import Options
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.shapes import compute_world_box, get_link_name
-from vkc_pin.world.scene.footing import Footing, find_footing
+from vkc_pin.world.scene.footing import Footing, LabelledShape, find_footing
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 from vkc_pin.world.scene.scene import Scene
@@ -29,7 +29,8 @@ def check_footings(scene: Scene, tasks: Sequence[Task]) -> None:
     """Check that every free object rests on something where it is released.
 
     A placement that only the motion decides is left to the validation of the motion, as is that of
-    what is put down where such an object may be. An object may be put back where the scene has it.
+    an object that is put down where such an object may be. An object may be put back where the
+    scene has it.
 
     Args:
         scene: Scene in which the first task starts.
@@ -38,31 +39,52 @@ def check_footings(scene: Scene, tasks: Sequence[Task]) -> None:
     Raises:
         InputError: An object would fall or tip over, and its step does not say `unsupported`.
     """
-    turned, lost = set[str](), set[str]()
+    turned = set[str]()  # objects whose heading is unknown
+    lost = set[str]()  # objects whose placement is unknown
     number = 0
     for task in tasks:
         for boundary, (step, phases) in enumerate(_divide_by_step(task)):
             is_allowed = getattr(step, "unsupported", False)
             for phase in phases:
-                # Later, it is released wherever the motion has brought it.
+                # Later, an object is released wherever the motion has brought it.
                 is_known = phase.kind != "stand" or number == 0
-                for hold, pose in phase.lowered.items() if is_known else ():
-                    if not is_allowed and not _is_put_back(scene, hold, pose):
-                        footing = _find_best_footing(scene, phase, hold, pose)
-                        is_unknown = lost or _is_near(scene, phase, hold, pose, turned)
-                        # Planning explains better what an object overlaps at its goal.
-                        is_fine = footing.is_stable() or footing.is_blocked
-                        if not is_fine and not is_unknown:
-                            raise _make_error(hold.object, footing, f"steps[{number}]")
+                if is_known and not is_allowed and not lost:
+                    _check_lowered(scene, phase, turned, f"steps[{number}]")
             released = _list_released(scene, task, boundary, phases)
-            goals = [
-                goal for phase in phases for goal in phase.frames if goal.hold in phase.lowered
-            ]
-            exact = {goal.hold.object for goal in goals if goal.hold and goal.kind == "pose"}
-            upright = {goal.hold.object for goal in goals if goal.hold and goal.kind == "upright"}
+            exact = _list_goals(phases, "pose")
+            upright = _list_goals(phases, "upright")
             turned = (turned | (released & upright)) - exact
             lost = (lost | (released - upright)) - exact - upright
             number += 1
+
+
+def _check_lowered(scene: Scene, phase: Phase, turned: set[str], where: str) -> None:
+    """Check that the objects that are put down in a phase rest on something.
+
+    Args:
+        scene: Scene in which the first task starts.
+        phase: The phase.
+        turned: Objects whose headings are unknown; an object near them may rest on them.
+        where: Field of the step, for the error.
+    """
+    for hold, pose in phase.lowered.items():
+        if _is_put_back(scene, hold, pose):
+            continue
+        footing = _find_best_footing(scene, phase, hold, pose)
+        # Planning explains overlaps of an object at its goal better.
+        is_fine = footing.is_stable() or footing.is_blocked
+        if not is_fine and not _is_near(scene, phase, hold, pose, turned):
+            raise _make_error(hold.object, footing, where)
+
+
+def _list_goals(phases: Sequence[Phase], kind: str) -> set[str]:
+    """Return the objects that are put down at a goal of a kind, "pose" or "upright"."""
+    found = set[str]()
+    for phase in phases:
+        for goal in phase.frames:
+            if goal.hold is not None and goal.hold in phase.lowered and goal.kind == kind:
+                found.add(goal.hold.object)
+    return found
 
 
 def _divide_by_step(task: Task) -> Iterator[tuple[object, tuple[Phase, ...]]]:
@@ -75,8 +97,9 @@ def _divide_by_step(task: Task) -> Iterator[tuple[object, tuple[Phase, ...]]]:
 
 def _list_released(scene: Scene, task: Task, number: int, phases: Sequence[Phase]) -> set[str]:
     """Return the free objects that a step releases, without those on them."""
-    before = task.boundaries[number - 1].after if number else scene.holds
-    held = {*before, *(hold for phase in phases for hold in (*phase.held, *phase.grasps))}
+    held = {*(task.boundaries[number - 1].after if number else scene.holds)}
+    for phase in phases:
+        held.update(phase.held, phase.grasps)
     released = held - {*task.boundaries[number].after}
     return {hold.object for hold in released if scene.objects[hold.object].object.free}
 
@@ -84,10 +107,11 @@ def _list_released(scene: Scene, task: Task, number: int, phases: Sequence[Phase
 def _is_near(scene: Scene, phase: Phase, hold: Hold, pose: pin.SE3, others: set[str]) -> bool:
     """Return whether an object may touch one of others, whose headings are unknown."""
     own = _Cylinder.around(scene.objects[hold.object], pose)
-    return any(
-        own.touches(_Cylinder.around(scene.objects[name], phase.resting[name]))
-        for name in others & phase.resting.keys()
-    )
+    for name in others & phase.resting.keys():
+        other = _Cylinder.around(scene.objects[name], phase.resting[name])
+        if own.touches(other):
+            return True
+    return False
 
 
 class _Cylinder(NamedTuple):
@@ -102,10 +126,14 @@ class _Cylinder(NamedTuple):
     def around(cls, placed: PlacedObject, pose: pin.SE3) -> _Cylinder:
         """Return the cylinder about the origin of the base link at a pose."""
         shapes = make_world_shapes(replace(placed, placement=pose))
+        # Lower and upper corners of the shapes, shape (n, 2, 3).
         boxes = np.array([compute_world_box(one.geometry, one.placement) for one in shapes])
         axis = pose.translation[:2]
-        radius = np.linalg.norm(np.abs(boxes[:, :, :2] - axis).max(axis=1), axis=1).max()
-        return cls(axis, float(radius), float(boxes[:, 0, 2].min()), float(boxes[:, 1, 2].max()))
+        farthest_corners = np.abs(boxes[:, :, :2] - axis).max(axis=1)
+        radius = np.linalg.norm(farthest_corners, axis=1).max()
+        low = boxes[:, 0, 2].min()
+        high = boxes[:, 1, 2].max()
+        return cls(axis, float(radius), float(low), float(high))
 
     def touches(self, other: _Cylinder) -> bool:
         """Return whether two cylinders are closer than an object is to its support."""
@@ -129,13 +157,11 @@ def _find_best_footing(scene: Scene, phase: Phase, hold: Hold, pose: pin.SE3) ->
     """Return how an object stands where a phase ends; if its heading is free, at the best one."""
     name = hold.object
     state = {**phase.initial_values, **phase.values}
-    now = place_objects(scene, state, phase.resting)
-    others = [
-        (f"{other}.{get_link_name(shape.name)}", shape)
-        for other, placed in now.items()
-        if other != name
-        for shape in make_world_shapes(placed)
-    ]
+    others = list[LabelledShape]()
+    for other, placed in place_objects(scene, state, phase.resting).items():
+        if other != name:
+            for shape in make_world_shapes(placed):
+                others.append((f"{other}.{get_link_name(shape.name)}", shape))
     others += zip(scene.obstacle_labels, scene.obstacles, strict=True)
     is_free = any(goal.hold == hold and goal.kind == "upright" for goal in phase.frames)
     headings = 2.0 * np.pi * np.arange(_HEADINGS if is_free else 1) / _HEADINGS
@@ -144,9 +170,10 @@ def _find_best_footing(scene: Scene, phase: Phase, hold: Hold, pose: pin.SE3) ->
         rotation = pin.exp3(np.array([0.0, 0.0, heading])) @ pose.rotation
         placed = replace(scene.objects[name], placement=pin.SE3(rotation, pose.translation))
         load = list(_place_load(scene, phase, hold, placed))
-        found.append(find_footing(placed, others, load))
-        if found[-1].is_stable():
-            return found[-1]
+        footing = find_footing(placed, others, load)
+        if footing.is_stable():
+            return footing
+        found.append(footing)
     return found[0]
 
 
@@ -176,19 +203,21 @@ def check_loads(scene: Scene, tasks: Iterable[Task], options: Options) -> None:
     payload = scene.robot.payload
     if payload is None:
         return
-    most = payload * options.payload_factor
+    max_mass = payload * options.payload_factor
     number = 0
     for task in tasks:
         for _, phases in _divide_by_step(task):
             for phase in phases:
                 names = _list_carried_objects(scene, phase)
                 mass = sum(scene.objects[name].object.mass for name in names)
-                if mass > most:
-                    what = " and ".join(f"'{name}'" for name in names)
-                    problem = f"the hand would carry {mass:.3g} kg, {what}"
-                    expected = f"at most {most:.3g} kg, the payload of '{scene.robot.name}'"
-                    expected += ", or a larger Options.payload_factor"
-                    raise InputError(problem, field=f"steps[{number}]", expected=expected)
+                if mass > max_mass:
+                    objects = " and ".join(f"'{name}'" for name in names)
+                    raise InputError(
+                        f"the hand would carry {mass:.3g} kg, {objects}",
+                        field=f"steps[{number}]",
+                        expected=f"at most {max_mass:.3g} kg, the payload of '{scene.robot.name}', "
+                        "or a larger Options.payload_factor",
+                    )
             number += 1
 
 

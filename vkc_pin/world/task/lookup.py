@@ -14,6 +14,7 @@ from vkc_pin.world.scene.contact_rules import (
     compute_start_opening,
     find_gripper_hold,
 )
+from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Phase
@@ -69,7 +70,8 @@ def find_robot_frame(scene: Scene, name: str | None, where: str) -> str:
 def find_path_joints(placed: PlacedObject, attachment: Attachment) -> list[str]:
     """Return the names of the joints from an object's base to an attachment's link."""
     model = placed.object.model
-    joint = model.frames[model.getFrameId(attachment.link, pin.FrameType.BODY)].parentJoint
+    frame = model.frames[model.getFrameId(attachment.link, pin.FrameType.BODY)]
+    joint = frame.parentJoint
     names: list[str] = []
     while joint:
         names.insert(0, str(model.names[joint]))
@@ -79,7 +81,8 @@ def find_path_joints(placed: PlacedObject, attachment: Attachment) -> list[str]:
 
 def find_joint_limits(placed: PlacedObject, coordinate: str) -> tuple[float, float]:
     """Return the limits of an object's coordinate `<object>.<joint>`, [rad] or [m]."""
-    index = placed.object.coordinates.names.index(coordinate.partition(".")[2])
+    _, _, joint = coordinate.partition(".")
+    index = placed.object.coordinates.names.index(joint)
     return float(placed.object.lower[index]), float(placed.object.upper[index])
 
 
@@ -89,10 +92,15 @@ def compute_openings(scene: Scene, phases: Sequence[Phase]) -> list[float | None
     It is the opening of the attachment that the gripper holds or grasps next; after the last grasp
     it does not change.
     """
-    gripper_holds = [find_gripper_hold((*phase.held, *phase.grasps)) for phase in phases]
-    found = list[float | None]()
-    for number in range(len(phases)):
-        hold = next((one for one in gripper_holds[number:] if one is not None), None)
-        before = found[-1] if found else compute_start_opening(scene)
-        found.append(before if hold is None else compute_grasp_opening(scene, hold))
-    return found
+    next_holds = list[Hold | None]()
+    hold = None
+    for phase in reversed(phases):
+        hold = find_gripper_hold((*phase.held, *phase.grasps)) or hold
+        next_holds.insert(0, hold)
+    openings = list[float | None]()
+    opening = compute_start_opening(scene)
+    for next_hold in next_holds:
+        if next_hold is not None:
+            opening = compute_grasp_opening(scene, next_hold)
+        openings.append(opening)
+    return openings

@@ -27,9 +27,8 @@ def _check_names(step: Any, **optional: bool) -> None:
     for name, may_be_none in optional.items():
         value = getattr(step, name)
         if value is not None or not may_be_none:
-            object.__setattr__(
-                step, name, check_text(value, f"{type(step).__name__}.{name}", "a name")
-            )
+            checked = check_text(value, f"{type(step).__name__}.{name}", "a name")
+            object.__setattr__(step, name, checked)
 
 
 @dataclass(frozen=True)
@@ -106,11 +105,9 @@ class Actuate:
                 expected=expected,
                 got=format_value(self.joints),
             )
-        given = check_mapping(self.joints, "Actuate.joints", expected)
-        joints = {
-            name: check_coordinate(value, f"Actuate.joints[{name!r}]")
-            for name, value in given.items()
-        }
+        joints = dict[str, float]()
+        for name, value in check_mapping(self.joints, "Actuate.joints", expected).items():
+            joints[name] = check_coordinate(value, f"Actuate.joints[{name!r}]")
         object.__setattr__(self, "joints", joints)
 
 
@@ -204,10 +201,9 @@ class Configure:
         if not isinstance(self.joints, Mapping) or not self.joints:
             got = format_value(self.joints)
             raise InputError("nothing to configure", field=field, expected=expected, got=got)
-        given = check_mapping(self.joints, field, expected)
-        joints = {
-            name: check_coordinate(value, f"{field}[{name!r}]") for name, value in given.items()
-        }
+        joints = dict[str, float]()
+        for name, value in check_mapping(self.joints, field, expected).items():
+            joints[name] = check_coordinate(value, f"{field}[{name!r}]")
         object.__setattr__(self, "joints", joints)
         object.__setattr__(self, "tolerance", self._check_tolerance())
 
@@ -244,11 +240,10 @@ class GoTo:
     yaw: float | None = None
 
     def __post_init__(self) -> None:
-        for name in ("x", "y", "yaw"):
-            if name != "yaw" or self.yaw is not None:
-                object.__setattr__(
-                    self, name, check_coordinate(getattr(self, name), f"GoTo.{name}")
-                )
+        object.__setattr__(self, "x", check_coordinate(self.x, "GoTo.x"))
+        object.__setattr__(self, "y", check_coordinate(self.y, "GoTo.y"))
+        if self.yaw is not None:
+            object.__setattr__(self, "yaw", check_coordinate(self.yaw, "GoTo.yaw"))
 
 
 Step = Reach | Grasp | Actuate | GoTo | Touch | Place | Release | Configure
@@ -288,11 +283,11 @@ def describe_step(step: Step) -> str:
 
 def step_to_dict(step: Step) -> dict[str, Any]:
     """Return `step` as plain data, e.g. for a saved plan."""
-    own = {one.name: getattr(step, one.name) for one in fields(step) if one.init}
-    data = {"step": type(step).__name__, **own}
-    for name, value in data.items():
-        if isinstance(value, pin.SE3):
-            data[name] = value.homogeneous.tolist()
+    data: dict[str, Any] = {"step": type(step).__name__}
+    for item in fields(step):
+        if item.init:
+            value = getattr(step, item.name)
+            data[item.name] = value.homogeneous.tolist() if isinstance(value, pin.SE3) else value
     return data
 
 
@@ -305,7 +300,8 @@ def step_from_dict(data: Mapping[str, Any]) -> Step:
         if name not in known_fields:
             raise UnknownNameError(f"field of {kind}", name, known_fields, field=f"{kind}.{name}")
     for name, item in known_fields.items():
-        if name not in given and item.default is MISSING and item.default_factory is MISSING:
+        is_required = item.default is MISSING and item.default_factory is MISSING
+        if is_required and name not in given:
             raise InputError("this is missing", field=f"{kind}.{name}")
     step: Step = _KINDS[kind](**given)
     return step

@@ -32,7 +32,8 @@ class SupportTracker:
     """
 
     def __init__(self, scene: Scene, resting: dict[str, pin.SE3]) -> None:
-        self.scene, self.resting = scene, resting
+        self.scene = scene
+        self.resting = resting
         self.carried: tuple[SupportedObject, ...] = ()
         self.moved: set[str] = set()
         self._on_moving: tuple[SupportedObject, ...] = ()
@@ -78,9 +79,9 @@ class SupportTracker:
     def end_motion(self, state: Mapping[str, float], where: str) -> None:
         """Release the objects added by `begin_motion` at their new placements."""
         for one in self._on_moving:
-            name, after = one.hold.object, place_objects(self.scene, state, self.resting)
+            after = place_objects(self.scene, state, self.resting)
             self.resting[one.object] = compute_placement_after_motion(
-                one, self._put_down[one.object], after[name], where
+                one, self._put_down[one.object], after[one.hold.object], where
             )
         self._on_moving = ()
 
@@ -104,10 +105,13 @@ def place_objects(
     for name, placed in scene.objects.items():
         if placed.object.free and name not in resting:
             continue
-        prefix = f"{name}."
-        values = {c.removeprefix(prefix): v for c, v in state.items() if c.startswith(prefix)}
-        there = replace(placed, placement=resting.get(name, placed.placement))
-        found[name] = there.with_state(values)
+        values = dict[str, float]()
+        for coordinate, value in state.items():
+            owner, _, joint = coordinate.partition(".")
+            if owner == name:
+                values[joint] = value
+        moved = replace(placed, placement=resting.get(name, placed.placement))
+        found[name] = moved.with_state(values)
     return found
 
 
@@ -121,25 +125,30 @@ def find_objects_supported_by(
     supported = find_supported_objects(now, {hold.object: links}, free)
     if not supported:
         return ()
-    static_shapes = [
-        (f"{name}.{get_link_name(shape.name)}", shape)
-        for name, placed in now.items()
-        if name not in supported
-        for shape in make_world_shapes(placed)
-        if name != hold.object or get_link_name(shape.name) not in links
-    ]
+    static_shapes = list[tuple[str, pin.GeometryObject]]()
+    for name, placed in now.items():
+        if name in supported:
+            continue
+        for shape in make_world_shapes(placed):
+            link = get_link_name(shape.name)
+            is_moving = name == hold.object and link in links
+            if not is_moving:
+                static_shapes.append((f"{name}.{link}", shape))
     static_shapes += zip(scene.obstacle_labels, scene.obstacles, strict=True)
+    carrier = now[hold.object]
     found = []
     for name, label in supported.items():
-        other = min(find_supports(now[name], static_shapes), default=None)
-        if other is not None and not item.free:
-            both = f"'{label}' and '{other}'"
-            problem = f"'{name}' rests both on a moving and on a fixed link: {both}"
-            expected = "that it is removed, or rests on one of them only"
-            raise InputError(problem, field=where, expected=expected)
-        link, carrier = label.partition(".")[2], now[hold.object]
-        local = carrier.link_placement(link).actInv(now[name].placement)
-        found.append(SupportedObject(name, hold, link, local, carrier.placement))
+        static_support = min(find_supports(now[name], static_shapes), default=None)
+        if static_support is not None and not item.free:
+            raise InputError(
+                f"'{name}' rests both on a moving and on a fixed link: '{label}' and "
+                f"'{static_support}'",
+                field=where,
+                expected="that it is removed, or rests on one of them only",
+            )
+        _, _, link = label.partition(".")
+        placement_in_link = carrier.link_placement(link).actInv(now[name].placement)
+        found.append(SupportedObject(name, hold, link, placement_in_link, carrier.placement))
     return tuple(found)
 
 
@@ -155,8 +164,8 @@ def compute_placement_after_motion(
     return placement
 
 
-def _check_tilt(one: SupportedObject, angle: float, most: float, where: str) -> None:
-    if angle > most:
+def _check_tilt(one: SupportedObject, angle: float, max_angle: float, where: str) -> None:
+    if angle > max_angle:
         problem = f"'{one.object}' rests on '{one.support}', which would tilt too much"
-        expected = f"that it is removed before, or at most {most:g} rad"
+        expected = f"that it is removed before, or at most {max_angle:g} rad"
         raise InputError(problem, field=where, expected=expected, got=f"{angle:.3g} rad")

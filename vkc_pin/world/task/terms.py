@@ -61,7 +61,8 @@ class State:
 
     def coordinate(self, name: str) -> Any:
         """Return the value of a coordinate, [m] or [rad]."""
-        return self._find_symbols("coordinate", name)[0]
+        now, _ = self._find_symbols("coordinate", name)
+        return now
 
     def rate(self, name: str) -> Any:
         """Return the mean rate of a coordinate since the previous waypoint, [m/s] or [rad/s]."""
@@ -70,11 +71,13 @@ class State:
 
     def rotation(self, frame: str) -> Any:
         """Return the rotation of a frame, shape (3, 3); its columns are the frame's axes."""
-        return ca.reshape(self._find_symbols("frame", frame)[0][:9], 3, 3)
+        now, _ = self._find_symbols("frame", frame)
+        return ca.reshape(now[:9], 3, 3)
 
     def position(self, frame: str) -> Any:
         """Return the position of a frame, shape (3, 1) [m]."""
-        return self._find_symbols("frame", frame)[0][9:]
+        now, _ = self._find_symbols("frame", frame)
+        return now[9:]
 
     def velocity(self, frame: str) -> Any:
         """Return the mean velocity of a frame since the previous waypoint, shape (3, 1) [m/s]."""
@@ -97,38 +100,31 @@ class State:
             check_text(name, self._field or kind, f"the name of a {kind}")
         else:
             check_choice(name, choices, kind, self._field)
-        size = 12 if kind == "frame" else 1
-        return self._symbols[kind].setdefault(
-            name, (ca.SX.sym("now", size), ca.SX.sym("before", size))
-        )
+        symbols = self._symbols[kind]
+        if name not in symbols:
+            size = 12 if kind == "frame" else 1
+            symbols[name] = (ca.SX.sym("now", size), ca.SX.sym("before", size))
+        return symbols[name]
 
     def make_formula(self, value: Any) -> Formula:
         """Return an expression of this state's symbols, shape (rows, 1), as plain data."""
-        columns = [
-            [
-                pair[when]
-                for kind in ("frame", "coordinate")
-                for pair in self._symbols[kind].values()
-            ]
-            for when in (0, 1)
-        ]
-        inputs = ca.vertcat(*columns[0], *columns[1], self._dt)
+        frames = self._symbols["frame"]
+        coordinates = self._symbols["coordinate"]
+        pairs = [*frames.values(), *coordinates.values()]
+        present = [now for now, _ in pairs]
+        previous = [before for _, before in pairs]
+        inputs = ca.vertcat(*present, *previous, self._dt)
         function = ca.Function("term", [inputs], [ca.densify(value)])
         code = []
         for k in range(function.n_instructions()):
-            name, constant = _list_operations()[function.instruction_id(k)], 0.0
-            read, written = function.instruction_input(k), function.instruction_output(k)
-            if name == "const":
-                constant = float(function.instruction_constant(k))
-            code.append(
-                (name, tuple(read[1:] if name == "input" else read), int(written[-1]), constant)
-            )
-        return Formula(
-            tuple(self._symbols["frame"]),
-            tuple(self._symbols["coordinate"]),
-            value.numel(),
-            tuple(code),
-        )
+            name = _list_operations()[function.instruction_id(k)]
+            read = function.instruction_input(k)
+            written = function.instruction_output(k)
+            # An input is read from the argument read[0], of which there is one, at read[1].
+            operands = tuple(read[1:]) if name == "input" else tuple(read)
+            constant = float(function.instruction_constant(k)) if name == "const" else 0.0
+            code.append((name, operands, int(written[-1]), constant))
+        return Formula(tuple(frames), tuple(coordinates), value.numel(), tuple(code))
 
 
 @dataclass(frozen=True)
@@ -158,11 +154,12 @@ class Formula:
     @property
     def has_comparison(self) -> bool:
         """Whether a result is that of a comparison, which has no derivative."""
-        results: dict[int, str] = {}
+        operations: dict[int, str] = {}  # index of a result → the operation that wrote it last
         for name, read, written, _ in self.code:
-            if name == "output" and results.get(read[0]) in _COMPARISONS:
+            if name != "output":
+                operations[written] = name
+            elif operations.get(read[0]) in _COMPARISONS:
                 return True
-            results[written if name != "output" else -1] = name
         return False
 
     @property
@@ -196,38 +193,36 @@ class Formula:
         work: dict[int, Any] = {}
         results: list[Any] = [ca.SX(0)] * self.rows
         for name, read, written, constant in self.code:
-            operands = [work[index] for index in read] if name != "input" else []
             if name == "input":
                 work[written] = inputs[read[0]]
-            elif name == "const":
+                continue
+            operands = [work[index] for index in read]
+            if name == "const":
                 work[written] = ca.SX(constant)
             elif name == "output":
                 results[written] = operands[0]
             elif len(operands) == 1:
-                work[written] = ca.SX.unary(
-                    numbers[name], operands[0] + (ROUNDING if name == "sqrt" else 0.0)
-                )
+                shift = ROUNDING if name == "sqrt" else 0.0
+                work[written] = ca.SX.unary(numbers[name], operands[0] + shift)
             else:
                 work[written] = ca.SX.binary(numbers[name], *operands)
         return ca.Function("term", [inputs], [ca.vertcat(*results)])
 
     def evaluate(self, inputs: Floats) -> Floats:
         """Return its results, shape (S, rows), at inputs of shape (S, 2·state_size + 1)."""
-        return (
-            np.asarray(self.function(np.ascontiguousarray(inputs.T)), float)
-            .reshape(self.rows, len(inputs))
-            .T
-        )
+        columns = np.ascontiguousarray(inputs.T)
+        results = np.asarray(self.function(columns), float)
+        return results.reshape(self.rows, len(inputs)).T
 
 
 @cache
 def _list_operations() -> dict[int, str]:
     """Return CasADi's operations by number, with the names used in files."""
-    return {
-        getattr(ca, name): name.removeprefix("OP_").lower()
-        for name in dir(ca)
-        if name.startswith("OP_")
-    }
+    operations = {}
+    for name in dir(ca):
+        if name.startswith("OP_"):
+            operations[getattr(ca, name)] = name.removeprefix("OP_").lower()
+    return operations
 
 
 Expression = Callable[[State], Any] | Formula
@@ -243,24 +238,27 @@ class _Term:
 
     def _check(self) -> None:
         if not isinstance(self.name, str) or not self.name:
-            field, got = f"{type(self).__name__}.name", format_value(self.name)
-            raise InputError("not a name", field=field, expected="text", got=got)
+            raise InputError(
+                "not a name",
+                field=f"{type(self).__name__}.name",
+                expected="text",
+                got=format_value(self.name),
+            )
         if not callable(self.expression) and not isinstance(self.expression, Formula):
             expected = "a function of a State, e.g. lambda s: s.coordinate('elbow_joint')"
-            raise self.make_error(
-                "not a function", "expression", expected, format_value(self.expression)
-            )
+            got = format_value(self.expression)
+            raise self.make_error("not a function", "expression", expected, got)
         if self.during is not None:
             names = (self.during,) if isinstance(self.during, str) else self.during
-            listed = isinstance(names, list | tuple) and len(names) > 0
-            if not listed or not all(isinstance(name, str) for name in names):
-                expected, got = "names of phases, e.g. ['place cup']", format_value(self.during)
+            is_list = isinstance(names, list | tuple) and len(names) > 0
+            if not is_list or not all(isinstance(name, str) for name in names):
+                expected = "names of phases, e.g. ['place cup']"
+                got = format_value(self.during)
                 raise self.make_error("not phases", "during", expected, got)
             object.__setattr__(self, "during", tuple(names))
         if self.holding is not None and not isinstance(self.holding, str):
-            raise self.make_error(
-                "not an object", "holding", "an object's name", format_value(self.holding)
-            )
+            got = format_value(self.holding)
+            raise self.make_error("not an object", "holding", "an object's name", got)
 
     def make_error(
         self, problem: str, field: str, expected: object = None, got: object = None
@@ -272,16 +270,16 @@ class _Term:
 
     def _check_positive(self, field: str) -> None:
         """Check that a field is a positive number."""
-        where, expected = f"terms[{self.name!r}].{field}", "a positive finite number"
-        object.__setattr__(
-            self, field, check_number(getattr(self, field), where, expected, low=0.0, strict=True)
-        )
+        where = f"terms[{self.name!r}].{field}"
+        expected = "a positive finite number"
+        value = check_number(getattr(self, field), where, expected, low=0.0, strict=True)
+        object.__setattr__(self, field, value)
 
     def is_active(self, phase: str, held: Iterable[str]) -> bool:
         """Return whether the term applies in a phase called `phase`, in which `held` are held."""
-        return (self.during is None or phase in self.during) and (
-            self.holding is None or self.holding in held
-        )
+        if self.during is not None and phase not in self.during:
+            return False
+        return self.holding is None or self.holding in held
 
     @property
     def formula(self) -> Formula:
@@ -322,10 +320,12 @@ class Constraint(_Term):
         self.compute_bounds(self.expression.rows if isinstance(self.expression, Formula) else None)
 
     def _check_bound(self, field: str, value: Any) -> float | tuple[float, ...]:
-        where, expected = f"terms[{self.name!r}].{field}", "a number or a list of them"
+        where = f"terms[{self.name!r}].{field}"
+        expected = "a number or a list of them"
         given = check_array(value, where, expected, problem="not a number")
-        wrong = np.isnan(given) | (given == (np.inf if field == "lower" else -np.inf))
-        if given.ndim > 1 or not given.size or wrong.any():
+        impossible = np.inf if field == "lower" else -np.inf
+        is_wrong = np.isnan(given) | (given == impossible)
+        if given.ndim > 1 or not given.size or is_wrong.any():
             raise self.make_error("no such bound", field, expected, format_value(value))
         return float(given) if given.ndim == 0 else tuple(given.tolist())
 
@@ -340,15 +340,14 @@ class Constraint(_Term):
             got = format_value((self.lower, self.upper))
             return self.make_error(problem, "lower, upper", expected, got)
 
-        given = [
-            -np.inf if self.lower is None else self.lower,
-            np.inf if self.upper is None else self.upper,
-        ]
+        given_lower = -np.inf if self.lower is None else self.lower
+        given_upper = np.inf if self.upper is None else self.upper
         try:
             if rows is None:
-                lower, upper = np.broadcast_arrays(*given)
+                lower, upper = np.broadcast_arrays(given_lower, given_upper)
             else:
-                lower, upper = (np.broadcast_to(bound, (rows,)) for bound in given)
+                lower = np.broadcast_to(given_lower, (rows,))
+                upper = np.broadcast_to(given_upper, (rows,))
         except ValueError:
             expected = f"one number, or {rows}, like the expression"
             if rows is None:
@@ -390,23 +389,22 @@ def trace_terms(scene: Scene, terms: Sequence[Term]) -> tuple[Term, ...]:
     terms = check_list(terms, "terms", "a list of Constraint and Cost", (Constraint, Cost))
     if not terms:
         return ()
-    items_by_name = [(name, placed.object) for name, placed in scene.objects.items()]
-    links = [f"{name}.{link}" for name, item in items_by_name for link in item.links]
-    frames = [*scene.robot.frame_names, *links]
-    joints = [f"{name}.{joint}" for name, item in items_by_name for joint in item.coordinates.names]
+    frames = [*scene.robot.frame_names]
+    coordinates = [*scene.robot.coordinates.names]
+    for name, placed in scene.objects.items():
+        frames += [f"{name}.{link}" for link in placed.object.links]
+        coordinates += [f"{name}.{joint}" for joint in placed.object.coordinates.names]
     for term in terms:
         if term.holding is not None and term.holding not in scene.objects:
-            raise UnknownNameError(
-                "object", term.holding, scene.objects, field=f"terms[{term.name!r}].holding"
-            )
-    return _trace_all(terms, frames, [*scene.robot.coordinates.names, *joints])
+            field = f"terms[{term.name!r}].holding"
+            raise UnknownNameError("object", term.holding, scene.objects, field=field)
+    return _trace_all(terms, frames, coordinates)
 
 
 def trace_terms_without_scene(terms: Sequence[Term]) -> tuple[Term, ...]:
     """Return terms with their expressions as plain data; all names are accepted."""
-    return _trace_all(
-        check_list(terms, "terms", "a list of Constraint and Cost", (Constraint, Cost)), None, None
-    )
+    terms = check_list(terms, "terms", "a list of Constraint and Cost", (Constraint, Cost))
+    return _trace_all(terms, None, None)
 
 
 def rename_term(term: Term, frames: Mapping[str, str], objects: Mapping[str, str]) -> Term:
@@ -417,9 +415,12 @@ def rename_term(term: Term, frames: Mapping[str, str], objects: Mapping[str, str
         frames: Name of a frame in its expression → its new name; others keep theirs.
         objects: Name of an object in `holding` → its new name.
     """
-    formula = term.formula
-    formula = replace(formula, frames=tuple(frames.get(name, name) for name in formula.frames))
-    return replace(term, expression=formula, holding=objects.get(term.holding or "", term.holding))
+    new_frames = [frames.get(name, name) for name in term.formula.frames]
+    formula = replace(term.formula, frames=tuple(new_frames))
+    holding = term.holding
+    if holding is not None:
+        holding = objects.get(holding, holding)
+    return replace(term, expression=formula, holding=holding)
 
 
 def _trace_all(
@@ -427,10 +428,15 @@ def _trace_all(
 ) -> tuple[Term, ...]:
     found: list[Term] = []
     for term in terms:
-        if term.name in (other.name for other in found):
-            expected, got = "different names", format_value(term.name)
-            raise InputError("two terms share a name", field="terms", expected=expected, got=got)
-        found.append(_trace(term, State(frames, coordinates, f"terms[{term.name!r}].expression")))
+        if any(other.name == term.name for other in found):
+            raise InputError(
+                "two terms share a name",
+                field="terms",
+                expected="different names",
+                got=format_value(term.name),
+            )
+        state = State(frames, coordinates, f"terms[{term.name!r}].expression")
+        found.append(_trace(term, state))
     return tuple(found)
 
 
@@ -450,10 +456,11 @@ def _trace(term: Term, state: State) -> Term:
         raise term.make_error(_CONSTANT, "expression", _DEPENDENT, format_value(value))
     if not isinstance(value, ca.SX):
         expected = "a number or a column, e.g. of ca.vertcat"
-        problem, got = "not a CasADi expression", format_value(value)
-        raise term.make_error(problem, "expression", expected, got)
+        got = format_value(value)
+        raise term.make_error("not a CasADi expression", "expression", expected, got)
     is_cost = isinstance(term, Cost)
-    if not value.is_vector() or value.is_empty() or (is_cost and not value.is_scalar()):
+    is_column = value.is_vector() and not value.is_empty()
+    if not is_column or (is_cost and not value.is_scalar()):
         expected = "a number" if is_cost else "a number or a column"
         raise term.make_error("wrong shape", "expression", expected, f"shape {value.shape}")
     try:
@@ -479,11 +486,14 @@ def check_terms_active(terms: Iterable[Term], phases: Sequence[tuple[str, Iterab
             if name not in names:
                 raise UnknownNameError("phase", name, names, field=f"terms[{term.name!r}].during")
         if not any(term.is_active(name, held) for name, held in phases):
-            held = ", ".join(
+            held_in_phases = [
                 f"{name!r} holds {', '.join(held) or 'nothing'}" for name, held in phases
-            )
+            ]
             raise term.make_error(
-                "never held in these phases", "holding", held, format_value(term.holding)
+                "never held in these phases",
+                "holding",
+                expected=", ".join(held_in_phases),
+                got=format_value(term.holding),
             )
 
 
@@ -497,16 +507,27 @@ def term_from_dict(data: Mapping[str, Any]) -> Term:
     fields = check_mapping(data, "terms", "a term as data")
     kinds: dict[str, type[Constraint] | type[Cost]] = {"Constraint": Constraint, "Cost": Cost}
     try:
-        given = fields.pop("expression")
-        code = tuple(
-            (str(name), tuple(map(int, read)), int(written), float(value))
-            for name, read, written, value in given["code"]
-        )
-        formula = Formula(
-            tuple(given["frames"]), tuple(given["coordinates"]), int(given["rows"]), code
-        )
-        formula.function  # noqa: B018 - raises an error for an invalid expression
-        return kinds[fields.pop("term")](expression=formula, **fields)
+        formula = _formula_from_dict(fields.pop("expression"))
+        kind = kinds[fields.pop("term")]
+        return kind(expression=formula, **fields)
     except (LookupError, TypeError, ValueError, OverflowError, RuntimeError) as error:
-        problem, expected = "not a saved term", "a term written by Plan.save"
-        raise InputError(problem, field="terms", expected=expected, got=str(error)) from error
+        raise InputError(
+            "not a saved term",
+            field="terms",
+            expected="a term written by Plan.save",
+            got=str(error),
+        ) from error
+
+
+def _formula_from_dict(data: Any) -> Formula:
+    code = list[tuple[str, tuple[int, ...], int, float]]()
+    for name, read, written, constant in data["code"]:
+        code.append((str(name), tuple(map(int, read)), int(written), float(constant)))
+    formula = Formula(
+        frames=tuple(data["frames"]),
+        coordinates=tuple(data["coordinates"]),
+        rows=int(data["rows"]),
+        code=tuple(code),
+    )
+    formula.function  # noqa: B018 - raises an error for an invalid expression
+    return formula

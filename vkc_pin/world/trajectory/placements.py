@@ -51,10 +51,9 @@ class Motion:
         Far means 0.15 m, where rotations count with a lever arm of 0.5 m.
         """
         difference = np.abs(self.world[:, joints] - self.world[row, joints])
-        turned, shifted = difference[..., :3, :3], difference[..., :3, 3]
-        return np.asarray(
-            (0.5 * turned.max(axis=(1, 2, 3)) > 0.15) | (shifted.max(axis=(1, 2)) > 0.15)
-        )
+        turn = difference[..., :3, :3].max(axis=(1, 2, 3))
+        shift = difference[..., :3, 3].max(axis=(1, 2))
+        return np.asarray((0.5 * turn > 0.15) | (shift > 0.15))
 
 
 def key_times(trajectory: Trajectory, strides: Mapping[str, float] | None = None) -> Floats:
@@ -67,17 +66,19 @@ def key_times(trajectory: Trajectory, strides: Mapping[str, float] | None = None
         trajectory: The motion.
         strides: Coordinate → its largest step between key frames [rad], [m]. Default: 1.
     """
-    most = np.array([(strides or {}).get(name, _TURN) for name in trajectory.names])
-    curve, waypoints = trajectory.curve, trajectory.times
+    max_steps = np.array([(strides or {}).get(name, _TURN) for name in trajectory.names])
+    waypoints = trajectory.times
+    curve = trajectory.curve
     if curve is None:
         speeds = np.abs(trajectory.velocities())
-        return divide_intervals(waypoints, _count_pieces(waypoints, speeds, 0.0 * speeds, most))
+        counts = _count_pieces(waypoints, speeds, 0.0 * speeds, max_steps)
+        return divide_intervals(waypoints, counts)
     speeds, accelerations = curve.compute_max_rates()
     first = np.searchsorted(curve.times, waypoints[:-1])  # knots that are waypoints
     speeds_between = np.maximum.reduceat(speeds, first)
     accelerations_between = np.maximum.reduceat(accelerations, first)
-    counts = _count_pieces(waypoints, speeds_between, accelerations_between, most)
-    counts_of_cubics = _count_pieces(curve.times, speeds, accelerations, most)
+    counts = _count_pieces(waypoints, speeds_between, accelerations_between, max_steps)
+    counts_of_cubics = _count_pieces(curve.times, speeds, accelerations, max_steps)
     # Where velocities jump within a short cubic, it takes less to divide every cubic alone.
     divides_cubics = np.add.reduceat(counts_of_cubics, first) < counts
     is_edge = np.repeat(divides_cubics, np.diff([*first, len(speeds)]))
@@ -87,17 +88,17 @@ def key_times(trajectory: Trajectory, strides: Mapping[str, float] | None = None
     return divide_intervals(edges, counts_of_cubics[is_edge])
 
 
-def _count_pieces(times: Floats, speeds: Floats, accelerations: Floats, most: Floats) -> Ints:
+def _count_pieces(times: Floats, speeds: Floats, accelerations: Floats, max_steps: Floats) -> Ints:
     """Return into how many pieces to divide each interval between times, shape (K − 1,).
 
     Args:
         times: Shape (K,) [s].
         speeds: Largest ones in each interval, shape (K − 1, n).
         accelerations: Largest ones in each interval, shape (K − 1, n).
-        most: Largest step of each coordinate, shape (n,).
+        max_steps: Largest step of each coordinate, shape (n,).
     """
     durations = np.diff(times)[:, None]
-    steps = durations * speeds / most
+    steps = durations * speeds / max_steps
     # A function f is up to h²/8·max |f″| away from a line through two of its points, h apart.
     bends = durations * np.sqrt(accelerations / (8.0 * _BEND))
     counts = np.ceil(np.maximum(steps, bends).max(axis=1) - 1e-9)
@@ -121,7 +122,8 @@ def sample_motion(
             viewers follow the motion.
     """
     if trajectory is None:
-        times, rows = np.zeros(1), world.start[None]
+        times = np.zeros(1)
+        rows = world.start[None]
     else:
         if step is None:
             carries = _carries_free_objects(world.scene, trajectory)
@@ -130,7 +132,8 @@ def sample_motion(
         strides = dict(zip(world.coordinates.names, steps, strict=True))
         times = key_times(trajectory, strides) if times is None else np.asarray(times, float)
         rows = world.compute_positions(trajectory, times)
-    model, data = world.model, world.model.createData()
+    model = world.model
+    data = model.createData()
     tool = model.getFrameId(world.scene.robot.tool_frame)
     local: list[list[pin.SE3]] = [[] for _ in range(model.njoints)]
     placements = np.tile(np.eye(4), (len(rows), model.njoints, 1, 1))
@@ -141,13 +144,18 @@ def sample_motion(
             local[j].append(data.liMi[j].copy())
             placements[k, j] = data.oMi[j].homogeneous
         tools[k] = pin.updateFramePlacement(model, data, tool).translation
-    moving = world.coordinates.find_moved_joints(np.abs(rows - rows[0]).max(axis=0) > 1e-9)
+    changes = np.abs(rows - rows[0]).max(axis=0) > 1e-9
     return Motion(
-        np.asarray(times), local, placements, tools, placements[:, 1, :3, 3].copy(), moving
+        times=np.asarray(times),
+        local=local,
+        world=placements,
+        tool=tools,
+        base=placements[:, 1, :3, 3].copy(),
+        moving=world.coordinates.find_moved_joints(changes),
     )
 
 
 def _carries_free_objects(scene: Scene, trajectory: Trajectory) -> bool:
-    """Return whether a free object is held, or may lie on something that is moved."""
+    """Return whether a free object is held, or may rest on a link that is moved."""
     is_free = any(placed.object.free for placed in scene.objects.values())
     return is_free and any(phase.holds for phase in trajectory.phases)

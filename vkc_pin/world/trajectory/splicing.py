@@ -13,6 +13,8 @@ from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
+_MAX_GAP = 1e-6  # [m], [rad] between the end of a motion and the begin of the next
+
 
 def concatenate_trajectories(parts: Sequence[Trajectory], *, pause: float) -> Trajectory:
     """Concatenate motions, with pauses [s] where holds or the gripper opening change.
@@ -26,31 +28,43 @@ def concatenate_trajectories(parts: Sequence[Trajectory], *, pause: float) -> Tr
     robot = parts[0].robot_size
     names = list(dict.fromkeys(name for part in parts for name in part.names))
     curves = [_get_curve(part) for part in parts]
-    waypoints, knots, phases = _Rows(names), _Rows(names), list[PhaseSpan]()
+    waypoints = _Rows(names)
+    knots = _Rows(names)
+    phases = list[PhaseSpan]()
     for number, (part, curve) in enumerate(zip(parts, curves, strict=True)):
-        shift = waits = 0
+        shift = 0  # index of the motion's first waypoint in the whole one
+        rest = 0.0
         if number:
-            apart = np.abs(part.positions[0, :robot] - waypoints.last(part.names[:robot])).max()
-            if not apart <= 1e-6:
+            distances = np.abs(part.positions[0, :robot] - waypoints.last(part.names[:robot]))
+            largest = distances.max()
+            if not largest <= _MAX_GAP:
                 problem = "a motion does not begin where the one before it ends"
-                got = f"{apart:g} apart"
+                got = f"{largest:g} apart"
                 raise InputError(problem, field=f"parts[{number}]", got=got)
-            before, after = phases[-1], part.phases[0]
-            waits = set(before.holds) != set(after.holds) or before.opening != after.opening
-            shift = len(waypoints.times) - 1 + waits
-        rest = pause if waits else 0.0
+            shift = len(waypoints.times) - 1
+            if _changes_grasp(phases[-1], part.phases[0]):
+                # The rest has a segment of its own.
+                shift += 1
+                rest = pause
         waypoints.add(part.names, part.times, part.positions, rest)
         if curve is not None:
             knots.add(part.names, curve.times, curve.positions, rest, curve.rates)
         for k, phase in enumerate(part.phases):
-            first = phases[-1].last if phases else 0
-            first = phase.first + shift if k else first
+            first = phase.first + shift
+            if k == 0:
+                # The rest belongs to the phase after it.
+                first = phases[-1].last if phases else 0
             phases.append(replace(phase, first=first, last=phase.last + shift))
     whole = None
     if all(curve is not None for curve in curves):
         whole = Curve(np.array(knots.times), knots.fill(), np.array(knots.rates))
     times = np.array(waypoints.times)
     return Trajectory(tuple(names), times, waypoints.fill(), tuple(phases), robot, whole)
+
+
+def _changes_grasp(before: PhaseSpan, after: PhaseSpan) -> bool:
+    """Return whether holds or the gripper opening change between two phases."""
+    return set(before.holds) != set(after.holds) or before.opening != after.opening
 
 
 class _Rows:
@@ -75,17 +89,20 @@ class _Rows:
         begin = self.times[-1] + rest if self.times else 0.0
         skipped = 1 if self.times and not rest else 0
         shape = (len(times), len(self.names))
-        values, slopes = np.full(shape, np.nan), np.zeros(shape)
-        values[:, columns] = positions
-        slopes[:, columns] = 0.0 if rates is None else rates
-        moments = begin + (times - times[0])
-        self.rows += list(values[skipped:])
-        self.rates += list(slopes[skipped:])
-        self.times += moments[skipped:].tolist()
+        all_positions = np.full(shape, np.nan)
+        all_positions[:, columns] = positions
+        all_rates = np.zeros(shape)
+        if rates is not None:
+            all_rates[:, columns] = rates
+        shifted_times = begin + (times - times[0])
+        self.rows += list(all_positions[skipped:])
+        self.rates += list(all_rates[skipped:])
+        self.times += shifted_times[skipped:].tolist()
 
     def last(self, names: Sequence[str]) -> Floats:
         """Return the last values of coordinates."""
-        return np.asarray(self.rows[-1][[self.names.index(name) for name in names]])
+        columns = [self.names.index(name) for name in names]
+        return np.asarray(self.rows[-1][columns])
 
     def fill(self) -> Floats:
         return fill_missing_values(np.array(self.rows))
@@ -117,13 +134,16 @@ def extract_phases(
 ) -> Trajectory:
     """Extract phases and coordinates of a motion."""
     phases = trajectory.phases[begin:end]
-    first, last = phases[0].first, phases[-1].last
+    first = phases[0].first
+    last = phases[-1].last
+    spans = list[PhaseSpan]()
+    for phase in phases:
+        spans.append(replace(phase, first=phase.first - first, last=phase.last - first))
+    waypoints = slice(first, last + 1)
     columns = [trajectory.names.index(name) for name in names]
-    spans = tuple(
-        replace(phase, first=phase.first - first, last=phase.last - first) for phase in phases
-    )
-    rows, curve = slice(first, last + 1), trajectory.curve
-    times, positions = trajectory.times[rows], trajectory.positions[rows][:, columns]
+    times = trajectory.times[waypoints]
+    positions = trajectory.positions[waypoints][:, columns]
+    curve = trajectory.curve
     if curve is not None:
         curve = curve.part(times[0], times[-1], columns)
-    return Trajectory(tuple(names), times, positions, spans, trajectory.robot_size, curve)
+    return Trajectory(tuple(names), times, positions, tuple(spans), trajectory.robot_size, curve)

@@ -11,10 +11,10 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.world.models.articulated_object import ArticulatedObject
-from vkc_pin.world.models.dynamics import TorqueLimits
+from vkc_pin.world.models.dynamics import TorqueLimits, compute_inertia
 from vkc_pin.world.scene.contact_rules import compute_hand_frame
 from vkc_pin.world.scene.hold import Hold, get_attachment
+from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.curve import Curve, sample_intervals
 from vkc_pin.world.trajectory.free_objects import FreeObjects
@@ -27,7 +27,7 @@ _GRIP = 0.1  # lever arm of a hand, for the weighting of torques [m]
 _SINGULAR = 1e-9  # relative cutoff for joints that the hand cannot move
 # Velocity of a joint at rest [m/s], [rad/s], and distance from its latch or stop [m], [rad].
 _STILL = 1e-6
-_SHARES = np.array([0.0, 0.5, 1.0])  # of each cubic: accelerations jump at both ends
+_FRACTIONS = np.array([0.0, 0.5, 1.0])  # of each cubic: accelerations jump at both ends
 
 
 class Motion(NamedTuple):
@@ -42,12 +42,14 @@ class Handle:
     """A hand at an attachment of a fixed object."""
 
     def __init__(self, scene: Scene, hold: Hold, loads: Loads = ()) -> None:
-        self.name, self.placed = hold.object, scene.objects[hold.object]
+        self.name = hold.object
+        self.placed = scene.objects[hold.object]
         item = self.placed.object
         self.attachment = get_attachment(scene.objects, hold)
         self.point = compute_hand_frame(scene.robot, self.attachment)
+        # Springs carry the object itself, not its loads: they have a model with gravity.
         own = pin.Model(item.model)
-        own.gravity.linear = np.zeros(3)  # springs carry the object itself, not its loads
+        own.gravity.linear = np.zeros(3)
         self._models = [own]
         if loads:
             loaded = pin.Model(item.model)
@@ -62,94 +64,121 @@ class Handle:
         self._moved = [k for k, joint in enumerate(item.coordinates.joints) if joint in path]
 
     def wrenches(self, motion: Motion) -> Floats:
-        """Compute the hand's wrenches at `point` in world axes, shape (K, 6) [N], [N·m]."""
-        item, turn = self.placed.object, self.placed.placement.rotation
+        """Compute the hand's wrenches at `point` in world axes, shape (K, 6) [N], [N·m].
+
+        With D the twists of the hand at unit velocities of the joints that it moves, the wrench w
+        and the joint forces τ do the same work if D w = τ. In the free directions F of the grasp,
+        the hand exerts no force: F w = 0. Of all solutions w = B s, with the basis B, that with
+        the least |s| is taken.
+        """
+        item = self.placed.object
         forces = self.forces(motion)[:, self._moved]
-        z = self._rows(motion.positions, self.placed.state)
-        columns = [f"{self.name}.{name}" for name in self.attachment.coordinates]
-        values = np.column_stack(
-            [np.zeros((len(z), 0)), *(motion.positions[name] for name in columns)]
-        )
-        jacobians, turns, origins = _compute_jacobians(
+        z = self._collect_columns(motion.positions, self.placed.state)
+        freedoms = [np.zeros((len(z), 0))]
+        for name in self.attachment.coordinates:
+            freedoms.append(motion.positions[f"{self.name}.{name}"])
+        jacobians, rotations, origins = _compute_jacobians(
             self._models[0], self._frame, item.coordinates.q(z)
         )
-        points, free = self._grasp(turns, origins, values)
-        directions = np.swapaxes(jacobians[:, :, self._moved], 1, 2)
-        directions[..., :3] += np.cross(directions[..., 3:], (points - origins)[:, None])
-        maps = np.concatenate([directions, free], axis=1)
+        points, free = self._place_hand(rotations, origins, np.column_stack(freedoms))
+        # Twists of the link's frame, shape (K, joints, 6); v + ω × (p − o) at the hand.
+        twists = np.swapaxes(jacobians[:, :, self._moved], 1, 2)
+        twists[..., :3] += np.cross(twists[..., 3:], (points - origins)[:, None])
+        maps = np.concatenate([twists, free], axis=1)
         required = np.pad(forces, ((0, 0), (0, maps.shape[1] - forces.shape[1])))
-        basis = self._bases(turns)
-        shares = np.linalg.pinv(maps @ basis, rcond=_SINGULAR) @ required[..., None]
-        return np.asarray((basis @ shares)[..., 0] @ np.kron(np.eye(2), turn).T)
+        basis = self._make_bases(rotations)
+        weights = np.linalg.pinv(maps @ basis, rcond=_SINGULAR) @ required[..., None]
+        wrenches = (basis @ weights)[..., 0]
+        to_world = np.kron(np.eye(2), self.placed.placement.rotation)
+        return np.asarray(wrenches @ to_world.T)
 
-    def _grasp(self, turns: Floats, origins: Floats, values: Floats) -> tuple[Floats, Floats]:
+    def _place_hand(
+        self, rotations: Floats, origins: Floats, values: Floats
+    ) -> tuple[Floats, Floats]:
         """Compute positions of the hand and the free directions of its grasp, in the object's axes.
 
         The hand exerts no force in a free direction. Firm grasps and pushes have none.
+
+        Args:
+            rotations: Rotations of the grasped link, shape (K, 3, 3).
+            origins: Origins of its frame, shape (K, 3) [m].
+            values: Values of the f freedoms of the grasp, shape (K, f), [m] or [rad].
+
+        Returns:
+            Positions, shape (K, 3) [m], and twists of the free directions, shape (K, f, 6) or
+                (K, 0, 6).
         """
-        at, axes = self.attachment, list[tuple[Floats, Floats | None]]()
-        rotation, origin = turns @ at.placement.rotation, origins + turns @ at.placement.translation
-        for freedom, value in zip(at.freedoms, values.T, strict=True):
+        attachment = self.attachment
+        rotation = rotations @ attachment.placement.rotation
+        origin = origins + rotations @ attachment.placement.translation
+        axes = list[tuple[Floats, Floats | None]]()  # direction, and a point if it is revolute
+        for freedom, value in zip(attachment.freedoms, values.T, strict=True):
             axis = rotation @ freedom.axis
             if freedom.kind == "revolute":
                 through = origin + rotation @ freedom.through
-                rotation = rotation @ np.array(
-                    [pin.exp3(turn) for turn in np.outer(value, freedom.axis)]
-                )
+                rotation_vectors = np.outer(value, freedom.axis)
+                rotation = rotation @ np.array([pin.exp3(vector) for vector in rotation_vectors])
                 origin = through - rotation @ freedom.through
                 axes.append((axis, through))
             else:
                 origin = origin + axis * value[:, None]
                 axes.append((axis, None))
-        points = origin + rotation @ at.offset.translation
-        directions = np.zeros((len(turns), 0 if at.firm or at.contact == "push" else len(axes), 6))
-        for k, (axis, center) in enumerate(axes[: directions.shape[1]]):
-            directions[:, k, :3] = axis if center is None else np.cross(axis, points - center)
-            directions[:, k, 3:] = 0.0 if center is None else axis
-        return points, directions
+        points = origin + rotation @ attachment.offset.translation
+        if attachment.firm or attachment.contact == "push":
+            axes = []
+        twists = np.zeros((len(rotations), len(axes), 6))
+        for k, (axis, through_point) in enumerate(axes):
+            if through_point is None:
+                twists[:, k, :3] = axis
+            else:
+                twists[:, k, :3] = np.cross(axis, points - through_point)
+                twists[:, k, 3:] = axis
+        return points, twists
 
     def forces(self, motion: Motion) -> Floats:
         """Compute the joint forces, shape (K, joints) [N], [N·m]; springs carry the weight."""
         item = self.placed.object
-        z = self._rows(motion.positions, self.placed.state)
-        v, a = (
-            self._rows(part, np.zeros(len(self.placed.state)))
-            for part in (motion.velocities, motion.accelerations)
-        )
-        found, configurations = np.zeros(z.shape), item.coordinates.q(z)
+        rest = np.zeros(len(self.placed.state))
+        z = self._collect_columns(motion.positions, self.placed.state)
+        v = self._collect_columns(motion.velocities, rest)
+        a = self._collect_columns(motion.accelerations, rest)
+        found = np.zeros(z.shape)
+        configurations = item.coordinates.q(z)
         for model in self._models:
             data = model.createData()
             for k, q in enumerate(configurations):
                 found[k] += pin.rnea(model, data, q, v[k], a[k])
         held = {latch.joint: latch.held_at for latch in item.latches}
         for k, name in enumerate(item.coordinates.names):
-            resistance, rests = item.resistance.get(name), np.abs(v[:, k]) <= _STILL
+            is_still = np.abs(v[:, k]) <= _STILL
+            resistance = item.resistance.get(name)
             if resistance is not None:
-                found[:, k] += resistance.force(z[:, k], np.where(rests, 0.0, v[:, k]))
-            shut = np.abs(z[:, k] - held.get(name, np.inf)) <= _STILL
-            # Its stop or its bolt carries such forces.
-            shut |= (z[:, k] <= item.lower[k] + _STILL) & (found[:, k] > 0.0)
-            shut |= (z[:, k] >= item.upper[k] - _STILL) & (found[:, k] < 0.0)
-            found[rests & shut & (np.abs(a[:, k]) <= _STILL), k] = 0.0
+                found[:, k] += resistance.force(z[:, k], np.where(is_still, 0.0, v[:, k]))
+            # The latch or the stop carries the forces of a joint at rest there.
+            is_carried = np.abs(z[:, k] - held.get(name, np.inf)) <= _STILL
+            is_carried |= (z[:, k] <= item.lower[k] + _STILL) & (found[:, k] > 0.0)
+            is_carried |= (z[:, k] >= item.upper[k] - _STILL) & (found[:, k] < 0.0)
+            is_resting = is_still & (np.abs(a[:, k]) <= _STILL)
+            found[is_resting & is_carried, k] = 0.0
         return found
 
-    def _rows(self, part: Mapping[str, Floats], otherwise: Floats) -> Floats:
+    def _collect_columns(self, part: Mapping[str, Floats], otherwise: Floats) -> Floats:
         """Collect the object's coordinates as columns, shape (K, joints)."""
         size = len(next(iter(part.values())))
+        columns = [np.zeros((size, 0))]
         names = self.placed.object.coordinates.names
-        columns = (
-            part.get(f"{self.name}.{name}", np.full(size, value))
-            for name, value in zip(names, otherwise, strict=True)
-        )
-        return np.column_stack([np.zeros((size, 0)), *columns])
+        for name, value in zip(names, otherwise, strict=True):
+            columns.append(part.get(f"{self.name}.{name}", np.full(size, value)))
+        return np.column_stack(columns)
 
-    def _bases(self, turns: Floats) -> Floats:
-        """Compute bases of equally weighted wrenches, (K, 6, r); for a push, its direction."""
+    def _make_bases(self, rotations: Floats) -> Floats:
+        """Make bases of equally weighted wrenches, (K, 6, r); for a push, its direction."""
         if self.attachment.contact == "push":
-            return np.pad(turns @ self.attachment.placement.rotation[:, 2], ((0, 0), (0, 3)))[
-                ..., None
-            ]
-        return np.tile(np.diag([1.0] * 3 + [_GRIP] * 3), (len(turns), 1, 1))
+            normals = rotations @ self.attachment.placement.rotation[:, 2]
+            no_moments = ((0, 0), (0, 3))
+            return np.pad(normals, no_moments)[..., None]
+        weights = np.diag([1.0, 1.0, 1.0, _GRIP, _GRIP, _GRIP])
+        return np.tile(weights, (len(rotations), 1, 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,17 +200,18 @@ class MotionSamples:
 
 def sample_curve(curve: Curve) -> MotionSamples:
     """Sample every cubic of a curve at its ends and middle, with its own accelerations there."""
-    spans, count = np.diff(curve.times), len(curve.times) - 1
-    times = sample_intervals(curve.times, _SHARES)
+    times = sample_intervals(curve.times, _FRACTIONS)
+    # Accelerations of a cubic are linear: a(s) = a(0) + 2 s (a(1/2) − a(0)) at the fraction s.
+    durations = np.diff(curve.times)
     begin = curve.acceleration(curve.times[:-1])
-    middle = curve.acceleration(curve.times[:-1] + 0.5 * spans)
-    accelerations = begin[:, None] + 2.0 * _SHARES[None, :, None] * (middle - begin)[:, None]
+    middle = curve.acceleration(curve.times[:-1] + 0.5 * durations)
+    accelerations = begin[:, None] + 2.0 * _FRACTIONS[None, :, None] * (middle - begin)[:, None]
     return MotionSamples(
-        times,
-        np.repeat(np.arange(count), len(_SHARES)),
-        curve.at(times),
-        curve.velocity(times),
-        accelerations.reshape(len(times), -1),
+        times=times,
+        pieces=np.repeat(np.arange(len(durations)), len(_FRACTIONS)),
+        positions=curve.at(times),
+        velocities=curve.velocity(times),
+        accelerations=accelerations.reshape(len(times), -1),
     )
 
 
@@ -205,7 +235,8 @@ class Torques:
     def __init__(
         self, scene: Scene, trajectory: Trajectory, free: FreeObjects | None = None
     ) -> None:
-        self.scene, self.trajectory = scene, trajectory
+        self.scene = scene
+        self.trajectory = trajectory
         self._free = FreeObjects(scene, trajectory) if free is None else free
         self.torque_limits: TorqueLimits = scene.robot.efforts
         self._loads: dict[int, _Load] = {}
@@ -228,108 +259,142 @@ class Torques:
         for number in np.unique(phases).tolist():
             rows = np.flatnonzero(phases == number)
             found[rows] = self._compute_in_phase(
-                self._get_load(number),
-                *(part[rows] for part in (positions, velocities, accelerations)),
+                self._get_load(number), positions[rows], velocities[rows], accelerations[rows]
             )
         return found
 
     def along(self, times: Floats) -> Floats:
         """Compute torques of the robot's coordinates at times [s] in the motion, shape (K,)."""
         trajectory = self.trajectory
-        steps = np.clip(
-            np.searchsorted(trajectory.times, times, side="right") - 1, 0, len(trajectory.times) - 2
+        last_segment = len(trajectory.times) - 2
+        segments = np.searchsorted(trajectory.times, times, side="right") - 1
+        segments = np.clip(segments, 0, last_segment)
+        return self.at(
+            self.phases_of(segments),
+            trajectory.at(times),
+            trajectory.velocity(times),
+            trajectory.acceleration(times),
         )
-        motion = (
-            read(times) for read in (trajectory.at, trajectory.velocity, trajectory.acceleration)
-        )
-        return self.at(self.phases_of(steps), *motion)
 
     def phases_of(self, waypoints: Ints) -> Ints:
         """Return the phases of the segments after waypoints."""
-        return np.searchsorted(
-            [phase.last for phase in self.trajectory.phases[:-1]], waypoints, side="right"
-        )
+        ends = [phase.last for phase in self.trajectory.phases[:-1]]
+        return np.searchsorted(ends, waypoints, side="right")
 
     @cached_property
     def massless_objects(self) -> tuple[str, ...]:
         """Carried objects without mass data."""
-        phases = zip(self.trajectory.phases, self._free.supports, strict=True)
-        names = dict.fromkeys(
-            name for phase, supports in phases for name in (*phase.held, *supports)
-        )
-        items = {name: self.scene.objects[name].object for name in names}
-        return tuple(name for name, item in items.items() if item.free and not item.mass > 0.0)
+        names = dict[str, None]()
+        for phase, supports in zip(self.trajectory.phases, self._free.supports, strict=True):
+            names.update(dict.fromkeys((*phase.held, *supports)))
+        massless = list[str]()
+        for name in names:
+            item = self.scene.objects[name].object
+            if item.free and not item.mass > 0.0:
+                massless.append(name)
+        return tuple(massless)
 
     def _compute_in_phase(
         self, load: _Load, positions: Floats, velocities: Floats, accelerations: Floats
     ) -> Floats:
-        robot, size = self.scene.robot, self.trajectory.robot_size
+        robot = self.scene.robot
+        size = self.trajectory.robot_size
+        names = self.trajectory.names
         v, a = transform_to_base_axes(
             positions[:, 2], velocities[:, :size], accelerations[:, :size]
         )
-        data, found = load.model.createData(), np.empty((len(positions), size))
+        data = load.model.createData()
+        found = np.empty((len(positions), size))
         configurations = robot.coordinates.q(positions[:, :size])
         for k, q in enumerate(configurations):
             found[k] = pin.rnea(load.model, data, q, v[k], a[k])
-        parts = (
-            dict(zip(self.trajectory.names, part.T, strict=True))
-            for part in (positions, velocities, accelerations)
+        motion = Motion(
+            positions=dict(zip(names, positions.T, strict=True)),
+            velocities=dict(zip(names, velocities.T, strict=True)),
+            accelerations=dict(zip(names, accelerations.T, strict=True)),
         )
-        motion, frame = Motion(*parts), load.model.getFrameId(robot.tool_frame)
+        frame = load.model.getFrameId(robot.tool_frame)
         for handle in load.handles:
-            jacobians, turns, _ = _compute_jacobians(load.model, frame, configurations)
+            jacobians, rotations, _ = _compute_jacobians(load.model, frame, configurations)
             wrenches = handle.wrenches(motion)
-            wrenches[:, 3:] += np.cross(turns @ handle.point.translation, wrenches[:, :3])
+            # A force f at the point r of the hand has the moment r × f about the tool's origin.
+            arms = rotations @ handle.point.translation
+            wrenches[:, 3:] += np.cross(arms, wrenches[:, :3])
+            # τ = Jᵀ w
             found += np.einsum("kij,ki->kj", jacobians, wrenches)
         found[:, :3] = 0.0
         return found
 
     def _get_load(self, number: int) -> _Load:
         """Return the load of a phase."""
-        if number not in self._loads:
-            phase, objects = self.trajectory.phases[number], self.scene.objects
-            fixed = [hold for hold in phase.holds if not objects[hold.object].object.free]
-            loads: dict[str, list[tuple[int, pin.Inertia]]] = {hold.object: [] for hold in fixed}
-            model = pin.Model(self.scene.robot.model)
-            if self._free.names:
-                self._add_inertias(number, model, loads)
-            moved = [hold for hold in fixed if objects[hold.object].object.coordinates.size]
-            self._loads[number] = _Load(
-                model, tuple(Handle(self.scene, hold, loads[hold.object]) for hold in moved)
-            )
+        if number in self._loads:
+            return self._loads[number]
+        phase = self.trajectory.phases[number]
+        objects = self.scene.objects
+        fixed = [hold for hold in phase.holds if not objects[hold.object].object.free]
+        loads: dict[str, list[tuple[int, pin.Inertia]]] = {hold.object: [] for hold in fixed}
+        model = pin.Model(self.scene.robot.model)
+        if self._free.names:
+            self._add_inertias(number, model, loads)
+        handles = list[Handle]()
+        for hold in fixed:
+            if objects[hold.object].object.coordinates.size:
+                handles.append(Handle(self.scene, hold, loads[hold.object]))
+        self._loads[number] = _Load(model, tuple(handles))
         return self._loads[number]
 
     def _add_inertias(
         self, number: int, model: pin.Model, loads: dict[str, list[tuple[int, pin.Inertia]]]
     ) -> None:
         """Add the inertias of carried objects to the hand, of supported ones to their supports."""
-        phase, supports = self.trajectory.phases[number], self._free.supports[number]
+        phase = self.trajectory.phases[number]
+        supports = self._free.supports[number]
         objects = self.scene.objects
-        middle = self.trajectory.times[[phase.first, phase.last]].mean(keepdims=True)
         carried = [hold.object for hold in phase.holds if objects[hold.object].object.free]
-        if not (carried or supports):
+        if not carried and not supports:
             return
-        where, (row,) = self._free.at(middle), self.trajectory.at(middle)
-        data = model.createData()
+        middle = self.trajectory.times[[phase.first, phase.last]].mean(keepdims=True)
+        placements = self._free.at(middle)
+        (row,) = self.trajectory.at(middle)
         values = dict(zip(self.trajectory.names, row.tolist(), strict=True))
-        pin.forwardKinematics(
-            model, data, self.scene.robot.coordinates.q(row[: self.trajectory.robot_size])
-        )
-        hand = model.frames[model.getFrameId(self.scene.robot.tool_frame)].parentJoint
+        data = model.createData()
+        q = self.scene.robot.coordinates.q(row[: self.trajectory.robot_size])
+        pin.forwardKinematics(model, data, q)
+        tool = model.frames[model.getFrameId(self.scene.robot.tool_frame)]
+        hand = tool.parentJoint
         for name in (*carried, *supports):
-            whole = _compute_inertia(objects[name].object, objects[name].state)
-            body = pin.XYZQUATToSE3(where[name][0]).act(whole)
+            item = objects[name].object
+            own_inertia = compute_inertia(item.model, item.coordinates.q(objects[name].state))
+            placement = pin.XYZQUATToSE3(placements[name][0])
+            world_inertia = placement.act(own_inertia)
             owner, _, link = supports.get(name, "").partition(".")
             if name in carried or owner in carried:
-                model.inertias[hand] += data.oMi[hand].actInv(body)
+                model.inertias[hand] += data.oMi[hand].actInv(world_inertia)
             elif owner in loads:
-                item, own = objects[owner].object, objects[owner].placement.actInv(body)
-                joints = zip(item.coordinates.names, objects[owner].state.tolist(), strict=True)
-                state = np.array([values.get(f"{owner}.{joint}", value) for joint, value in joints])
-                inside = item.model.createData()
-                pin.forwardKinematics(item.model, inside, item.coordinates.q(state))
-                joint = item.model.frames[item.link_frame(link)].parentJoint
-                loads[owner].append((joint, inside.oMi[joint].actInv(own)))
+                load = _express_in_joint(objects[owner], link, values, world_inertia)
+                loads[owner].append(load)
+
+
+def _express_in_joint(
+    placed: PlacedObject, link: str, values: Mapping[str, float], inertia: pin.Inertia
+) -> tuple[int, pin.Inertia]:
+    """Return the joint of an object that carries a link, and an inertia in that joint's frame.
+
+    Args:
+        placed: The object.
+        link: The link.
+        values: Coordinate "<object>.<joint>" → value, where it differs from the object's state.
+        inertia: The inertia in the world frame.
+    """
+    item = placed.object
+    state = placed.state.astype(float)
+    for column, joint_name in enumerate(item.coordinates.names):
+        state[column] = values.get(f"{placed.name}.{joint_name}", state[column])
+    data = item.model.createData()
+    pin.forwardKinematics(item.model, data, item.coordinates.q(state))
+    joint = item.model.frames[item.link_frame(link)].parentJoint
+    in_object = placed.placement.actInv(inertia)
+    return joint, data.oMi[joint].actInv(in_object)
 
 
 def _compute_jacobians(
@@ -339,23 +404,21 @@ def _compute_jacobians(
 
     Also returns the frame's rotations, shape (K, 3, 3), and origins, shape (K, 3) [m].
     """
-    data, count = model.createData(), len(configurations)
-    placement = data.oMf[frame]  # both are views, which every evaluation updates
-    turn, origin = placement.rotation, placement.translation
+    data = model.createData()
+    count = len(configurations)
     jacobians = np.empty((count, 6, model.nv))
-    turns, origins = np.empty((count, 3, 3)), np.empty((count, 3))
+    rotations = np.empty((count, 3, 3))
+    origins = np.empty((count, 3))
+    placement = data.oMf[frame]
+    # Both are views, which every evaluation updates.
+    rotation = placement.rotation
+    origin = placement.translation
     for k, q in enumerate(configurations):
-        found = pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
-        jacobians[k], turns[k], origins[k] = found.reshape(6, -1), turn, origin
-    return jacobians, turns, origins
-
-
-def _compute_inertia(item: ArticulatedObject, state: Floats) -> pin.Inertia:
-    """Compute an object's total inertia in the base frame at joint values `state`, (n,)."""
-    data = item.model.createData()
-    pin.forwardKinematics(item.model, data, item.coordinates.q(state))
-    own = (data.oMi[j].act(inertia) for j, inertia in enumerate(item.model.inertias))
-    return sum(own, pin.Inertia.Zero())
+        jacobian = pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
+        jacobians[k] = jacobian.reshape(6, -1)
+        rotations[k] = rotation
+        origins[k] = origin
+    return jacobians, rotations, origins
 
 
 def transform_to_base_axes(
@@ -366,9 +429,13 @@ def transform_to_base_axes(
     The joint's velocity is expressed in the rotating base frame; its acceleration is the time
     derivative of these components.
     """
-    v, a = velocities.copy(), accelerations.copy()
+    v = velocities.copy()
+    a = accelerations.copy()
     for rows in (v, a):
-        rows[:, :2] = np.transpose(rotate_into_base_frame(rows[:, 0], rows[:, 1], yaws))
+        along, aside = rotate_into_base_frame(rows[:, 0], rows[:, 1], yaws)
+        rows[:, 0] = along
+        rows[:, 1] = aside
+    # With v in the base frame, which turns at ω, dv/dt = Rᵀ a − ω × v.
     a[:, 0] += v[:, 2] * v[:, 1]
     a[:, 1] -= v[:, 2] * v[:, 0]
     return v, a

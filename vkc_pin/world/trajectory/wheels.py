@@ -43,7 +43,9 @@ class RollingLimits:
     def compute_steps(path: Floats) -> tuple[Floats, Floats, Floats]:
         """Return longitudinal, lateral [m], angular motion [rad] of N segments, shape (N,) each."""
         dx, dy, turn = np.diff(path[:, :3], axis=0).T
-        return *rotate_into_base_frame(dx, dy, path[:-1, 2] + turn / 2), turn
+        mean_heading = path[:-1, 2] + turn / 2
+        along, aside = rotate_into_base_frame(dx, dy, mean_heading)
+        return along, aside, turn
 
     def compute_error(self, path: Floats) -> float:
         """Return the largest lateral motion, or shortfall of the turning radius [m]."""
@@ -62,20 +64,25 @@ class RollingLimits:
         known = np.flatnonzero(gear)
         if not len(known):
             return np.ones(len(gear))
+        # Segments before the first known gear have that one.
         last = np.searchsorted(known, np.arange(len(gear)), side="right") - 1
-        return np.asarray(gear[known[np.maximum(last, 0)]])
+        last_known = known[np.maximum(last, 0)]
+        return np.asarray(gear[last_known])
 
     def compute_min_times(self, path: Floats) -> Floats:
         """Return the shortest durations of segments at the wheels' speed limit, shape (N,) [s]."""
         if not self.has_wheel_limit:
             return np.zeros(len(path) - 1)
         along, _, turn = self.compute_steps(path)
-        return np.asarray((np.abs(along) + self.track / 2 * np.abs(turn)) / self.wheel_speed)
+        # The outer wheel rolls |c| + |δθ| times half of the track.
+        rolled = np.abs(along) + self.track / 2 * np.abs(turn)
+        return np.asarray(rolled / self.wheel_speed)
 
 
 def rotate_into_base_frame(x: Floats, y: Floats, yaws: Floats) -> tuple[Floats, Floats]:
     """Rotate world vectors (x, y) into base frames with these yaw angles, shape (K,) each."""
-    cos, sin = np.cos(yaws), np.sin(yaws)
+    cos = np.cos(yaws)
+    sin = np.sin(yaws)
     return cos * x + sin * y, cos * y - sin * x
 
 

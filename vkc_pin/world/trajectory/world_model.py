@@ -56,26 +56,25 @@ class World:
         self._robot_joints = int(self.model.njoints)
         self._joints: dict[str, list[int]] = {}
         for name, placed in scene.objects.items():
-            parent, placement = 0, placed.placement
+            parent = 0
+            placement = placed.placement
             if placed.object.free:
+                joint_name = f"{name}.{FREE_JOINT}"
                 parent = self.model.addJoint(
-                    0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), f"{name}.{FREE_JOINT}"
+                    0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), joint_name
                 )
                 placement = pin.SE3.Identity()
-            own, prefix = placed.object.model, f"{name}."
+            tree = placed.object.model
             self._joints[name] = graft(
-                self.model, own, parent=parent, placement=placement, prefix=prefix
+                self.model, tree, parent=parent, placement=placement, prefix=f"{name}."
             )
         objects = {name: placed.object.collision for name, placed in scene.objects.items()}
         self.bodies = self._graft_all(robot.collision, objects)
         self.shapes = (*self.bodies.geometryObjects, *scene.obstacles)
-        self.collision_labels = [
-            *(get_link_name(shape.name) for shape in self.bodies.geometryObjects),
-            *scene.obstacle_labels,
-        ]
-        self.collision_keys = make_shape_keys(
-            self.collision_labels, [shape.name for shape in self.shapes]
-        )
+        links = [get_link_name(shape.name) for shape in self.bodies.geometryObjects]
+        self.collision_labels = [*links, *scene.obstacle_labels]
+        shape_names = [shape.name for shape in self.shapes]
+        self.collision_keys = make_shape_keys(self.collision_labels, shape_names)
         self.coordinates = Coordinates(self.model)
         start = [np.asarray(scene.start)]
         if robot.gripper is not None:
@@ -111,9 +110,10 @@ class World:
         moving = len(shapes) - len(self.scene.obstacle_visual)
         labels = []
         for shape in shapes[:moving]:
+            # A part of a shape has the name `<link>_<number>_<part>`.
             label = get_link_name(shape.name)
-            while label not in links and "_" in label:  # a part is `<link>_<number>_<part>`
-                label = label.rpartition("_")[0]
+            while label not in links and "_" in label:
+                label, _, _ = label.rpartition("_")
             labels.append(label)
         return labels + [shape.name for shape in shapes[moving:]]
 
@@ -121,15 +121,23 @@ class World:
         self, robot: pin.GeometryModel, objects: Mapping[str, pin.GeometryModel]
     ) -> pin.GeometryModel:
         """Return the shapes of robot and objects, in this order."""
-        geometry, here, gripper = pin.GeometryModel(), pin.SE3.Identity(), self.scene.robot.gripper
-        own = list(robot.geometryObjects)
-        own = own if gripper is None else gripper.attach_shapes(own, self.scene.robot.model)
-        graft_geometry(geometry, own, joints=list(range(self._robot_joints)), placement=here)
+        geometry = pin.GeometryModel()
+        identity = pin.SE3.Identity()
+        robot_shapes = list(robot.geometryObjects)
+        gripper = self.scene.robot.gripper
+        if gripper is not None:
+            robot_shapes = gripper.attach_shapes(robot_shapes, self.scene.robot.model)
+        robot_joints = list(range(self._robot_joints))
+        graft_geometry(geometry, robot_shapes, joints=robot_joints, placement=identity)
         for name, source in objects.items():
             placed = self.scene.objects[name]
-            where, joints = here if placed.object.free else placed.placement, self._joints[name]
-            shapes, prefix = source.geometryObjects, f"{name}."
-            graft_geometry(geometry, shapes, joints=joints, placement=where, prefix=prefix)
+            graft_geometry(
+                geometry,
+                source.geometryObjects,
+                joints=self._joints[name],
+                placement=identity if placed.object.free else placed.placement,
+                prefix=f"{name}.",
+            )
         return geometry
 
     def compute_positions(
@@ -181,18 +189,20 @@ def _compute_finger_positions(
     Fingers move to the opening of a phase between its first two waypoints. In the first phase they
     have that opening from the start, unless the robot rests there.
     """
-    before, moments, values = gripper.compute_positions(start), list[float](), list[Floats]()
     robot = trajectory.positions[:, : trajectory.robot_size]
+    is_resting_first = np.array_equal(robot[0], robot[1])
+    knot_times = list[float]()
+    knots = list[Floats]()
+    before = gripper.compute_positions(start)
     for number, phase in enumerate(trajectory.phases):
-        here = gripper.compute_positions(phase.opening)
-        begin, then, end = (
-            float(trajectory.times[k]) for k in (phase.first, phase.first + 1, phase.last)
-        )
-        still = number > 0 or np.array_equal(robot[0], robot[1])
-        moments += [begin, then, end]
-        values += [before if still else here, here, here]
-        before = here
-    return np.column_stack([np.interp(times, moments, column) for column in np.array(values).T])
+        fingers = gripper.compute_positions(phase.opening)
+        starts_before = number > 0 or is_resting_first
+        for k in (phase.first, phase.first + 1, phase.last):
+            knot_times.append(float(trajectory.times[k]))
+        knots += [before if starts_before else fingers, fingers, fingers]
+        before = fingers
+    columns = np.array(knots).T
+    return np.column_stack([np.interp(times, knot_times, column) for column in columns])
 
 
 def compute_frame_placement(
@@ -209,21 +219,21 @@ def compute_frame_placement(
     Raises:
         UnknownNameError: There is no such frame.
     """
-    links = {
-        f"{name}.{link}": f"{name}.{link}"
-        for name, placed in scene.objects.items()
-        for link in placed.object.links
-    }
-    bases = {name: f"{name}.{placed.object.base_link}" for name, placed in scene.objects.items()}
-    robot = {name: name for name in scene.robot.frame_names}
-    known = {**links, **bases, **robot}
+    frames = dict[str, str]()  # name → frame of the world's model
+    for name, placed in scene.objects.items():
+        for link in placed.object.links:
+            frames[f"{name}.{link}"] = f"{name}.{link}"
+    for name, placed in scene.objects.items():
+        frames[name] = f"{name}.{placed.object.base_link}"
+    for name in scene.robot.frame_names:
+        frames[name] = name
     wanted = scene.robot.tool_frame if frame is None else frame
-    check_choice(wanted, known, "frame", "frame")
+    check_choice(wanted, frames, "frame", "frame")
     world = World(scene)
     (row,) = world.compute_positions(trajectory, [time])
     data = world.model.createData()
     pin.framesForwardKinematics(world.model, data, world.coordinates.q(row))
-    return data.oMf[world.model.getFrameId(known[wanted])].copy()
+    return data.oMf[world.model.getFrameId(frames[wanted])].copy()
 
 
 def make_scene_at(scene: Scene, world: World, row: Floats, values: Mapping[str, float]) -> Scene:
@@ -236,7 +246,7 @@ def make_scene_at(scene: Scene, world: World, row: Floats, values: Mapping[str, 
         values: Coordinates of the robot, and of joints of objects; clipped to their limits.
     """
     robot = np.array([values[name] for name in scene.robot.coordinates.names])
-    # A joint that stands still where it starts outside its limits stays there.
+    # A joint that starts outside its limits and does not move stays there.
     lower, upper = scene.robot.start_limits
     robot = np.clip(robot, np.minimum(lower, scene.start), np.maximum(upper, scene.start))
     robot[:2] = np.clip(robot[:2], scene.arena[::2], scene.arena[1::2])
@@ -245,12 +255,11 @@ def make_scene_at(scene: Scene, world: World, row: Floats, values: Mapping[str, 
         item = placed.object
         if item.free:
             after = after.with_placement(name, world.get_placement(name, row))
-        joints = zip(item.coordinates.names, item.lower, item.upper, strict=True)
-        state = {
-            joint: float(np.clip(values[f"{name}.{joint}"], low, high))
-            for joint, low, high in joints
-            if f"{name}.{joint}" in values
-        }
+        state = dict[str, float]()
+        for joint, low, high in zip(item.coordinates.names, item.lower, item.upper, strict=True):
+            coordinate = f"{name}.{joint}"
+            if coordinate in values:
+                state[joint] = float(np.clip(values[coordinate], low, high))
         if state:
             after = after.with_state(name, state)
     return after
@@ -261,26 +270,28 @@ def compute_final_scene(scene: Scene, trajectory: Trajectory, holds: Sequence[Ho
     last = dict(zip(trajectory.names, trajectory.positions[-1].tolist(), strict=True))
     world = World(scene)
     (row,) = world.compute_positions(trajectory, trajectory.times[-1:])
-    after, held = make_scene_at(scene, world, row, last), []
+    after = make_scene_at(scene, world, row, last)
+    final_holds = list[Hold]()
     for hold in holds:
         attachment = scene.objects[hold.object].object.attachment(hold.attachment)
-        freedoms = zip(attachment.coordinates, attachment.freedoms, strict=True)
-        at = tuple(
-            float(np.clip(last[f"{hold.object}.{name}"], freedom.lower, freedom.upper))
-            for name, freedom in freedoms
-        )
-        held.append(dataclasses.replace(hold, at=at))
-    return dataclasses.replace(after.with_held(held), opening=trajectory.phases[-1].opening)
+        at = list[float]()
+        for name, freedom in zip(attachment.coordinates, attachment.freedoms, strict=True):
+            value = last[f"{hold.object}.{name}"]
+            at.append(float(np.clip(value, freedom.lower, freedom.upper)))
+        final_holds.append(dataclasses.replace(hold, at=tuple(at)))
+    after = after.with_held(final_holds)
+    return dataclasses.replace(after, opening=trajectory.phases[-1].opening)
 
 
 def find_coordinate_units(scene: Scene) -> dict[str, str]:
     """Return coordinate → unit, "m" or "rad", of robot, objects and freedoms of grasps."""
-    own = scene.robot.coordinates
-    units = dict(zip(own.names, own.units, strict=True))
+    robot = scene.robot.coordinates
+    units = dict(zip(robot.names, robot.units, strict=True))
     for owner, placed in scene.objects.items():
-        own = placed.object.coordinates
-        pairs = [*zip(own.names, own.units, strict=True)]
+        coordinates = placed.object.coordinates
+        for name, unit in zip(coordinates.names, coordinates.units, strict=True):
+            units[f"{owner}.{name}"] = unit
         for grasp in placed.object.attachments.values():
-            pairs += zip(grasp.coordinates, (one.unit for one in grasp.freedoms), strict=True)
-        units |= {f"{owner}.{name}": unit for name, unit in pairs}
+            for name, freedom in zip(grasp.coordinates, grasp.freedoms, strict=True):
+                units[f"{owner}.{name}"] = freedom.unit
     return units

@@ -17,7 +17,7 @@ from vkc_pin.world.trajectory.curve import MIN_INTERVAL
 
 _POSITION_ACCURACY = 1e-6  # [m] or [rad], of cubics in place of a quintic
 _ACCELERATION_ACCURACY = 1e-3  # of the largest acceleration: validation accepts as much
-_MOST_PIECES = 100  # of a quintic; enough for these accuracies where it covers less than 20 m
+_MAX_PIECES = 100  # of a quintic; enough for these accuracies where it covers less than 20 m
 _BERNSTEIN_AT_THIRDS = np.array([[27, 0, 0, 0], [8, 12, 6, 1], [1, 6, 12, 8], [0, 0, 0, 27]]) / 27.0
 _JUMP = 1e-6  # [s] in which velocities jump at the ends of lines
 
@@ -49,24 +49,21 @@ def interpolate_points(
     has_acceleration = np.array([row is not None for row in accelerations])
     is_line = ~(has_velocity[:-1] & has_velocity[1:])
     is_quintic = ~is_line & has_acceleration[:-1] & has_acceleration[1:]
-    states = [
-        [row for row in point if row is not None]
-        for point in zip(positions, velocities, accelerations, strict=True)
-    ]
+    states = list[list[Floats]]()
+    for point in zip(positions, velocities, accelerations, strict=True):
+        states.append([row for row in point if row is not None])
     orders = np.where(is_line, 1, np.where(is_quintic, 5, 3))
     spline = BPoly.from_derivatives(times, states, orders=orders.tolist())
     slopes = np.diff(positions, axis=0) / np.diff(times)[:, None]
     rates = _choose_rates(slopes, velocities, is_line)
-    knots = [
-        _divide_quintics(spline, times, is_quintic),
-        _place_jumps(times, slopes, rates, is_line),
-    ]
-    inside = np.setdiff1d(np.concatenate(knots), times)
-    every = np.concatenate([times, inside])
-    order = np.argsort(every)
-    places = np.concatenate([positions, spline(inside)])
-    speeds = np.concatenate([rates, spline.derivative()(inside)])
-    return every[order], places[order], speeds[order]
+    divisions = _divide_quintics(spline, times, is_quintic)
+    jumps = _place_jumps(times, slopes, rates, is_line)
+    inside = np.setdiff1d(np.concatenate([divisions, jumps]), times)
+    knot_times = np.concatenate([times, inside])
+    knot_positions = np.concatenate([positions, spline(inside)])
+    knot_velocities = np.concatenate([rates, spline.derivative()(inside)])
+    order = np.argsort(knot_times)
+    return knot_times[order], knot_positions[order], knot_velocities[order]
 
 
 def _choose_rates(slopes: Floats, velocities: Sequence[Floats | None], is_line: Bools) -> Floats:
@@ -74,11 +71,13 @@ def _choose_rates(slopes: Floats, velocities: Sequence[Floats | None], is_line: 
 
     A line takes no notice of the velocity of a point: between two lines, the first one ends there.
     """
-    none = np.zeros((1, slopes.shape[1]))
-    rates = np.concatenate([none, slopes])
+    # Without a velocity, a point has that of the line before; the first and the last one rest.
+    rest = np.zeros((1, slopes.shape[1]))
+    rates = np.concatenate([rest, slopes])
     rates[-1] = 0.0
     for k, velocity in enumerate(velocities):
-        if velocity is not None and not is_line[max(k - 1, 0) : k + 1].all():
+        is_between_lines = is_line[max(k - 1, 0) : k + 1].all()
+        if velocity is not None and not is_between_lines:
             rates[k] = velocity
     return rates
 
@@ -104,18 +103,20 @@ def _divide_quintics(spline: Any, times: Floats, is_quintic: Bools) -> Floats:
     # up to h⁴/384·max |f⁗| away from it, and the second derivatives up to h²/12·max |f⁗|. Here f⁗
     # is linear, hence largest at one of its two control points.
     fourth = np.abs(spline.derivative(4).c[:, is_quintic]).max(axis=0)
-    off = squares**2 / 384.0 * fourth
-    bent = squares / 12.0 * fourth
+    position_errors = squares**2 / 384.0 * fourth
+    acceleration_errors = squares / 12.0 * fourth
     # Accelerations at the begin, after one and two thirds, and at the end.
     control = spline.derivative(2).c[:, is_quintic]
     accelerations = np.tensordot(_BERNSTEIN_AT_THIRDS, control, axes=1)
     largest = np.abs(accelerations).max(axis=(0, 1))
     accepted = np.maximum(_ACCELERATION_ACCURACY * largest, np.finfo(float).tiny)
-    counts = np.maximum((off / _POSITION_ACCURACY) ** 0.25, np.sqrt(bent / accepted))
-    pieces = np.clip(np.ceil(counts.max(axis=1)), 1, _MOST_PIECES).astype(int)
-    parts = [
-        begin + duration * np.arange(1, count) / count
-        for begin, duration, count in zip(begins, durations, pieces, strict=True)
-        if duration >= 2.0 * count * MIN_INTERVAL
-    ]
-    return np.concatenate([times[:0], *parts])
+    # With n pieces, the errors are divided by n⁴ and by n².
+    counts_for_positions = (position_errors / _POSITION_ACCURACY) ** 0.25
+    counts_for_accelerations = np.sqrt(acceleration_errors / accepted)
+    counts = np.maximum(counts_for_positions, counts_for_accelerations)
+    pieces = np.clip(np.ceil(counts.max(axis=1)), 1, _MAX_PIECES).astype(int)
+    divisions = [times[:0]]
+    for begin, duration, count in zip(begins, durations, pieces, strict=True):
+        if duration >= 2.0 * count * MIN_INTERVAL:
+            divisions.append(begin + duration * np.arange(1, count) / count)
+    return np.concatenate(divisions)

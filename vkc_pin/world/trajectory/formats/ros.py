@@ -32,7 +32,7 @@ from vkc_pin.world.trajectory.formats.tables import (
 
 _MAX_VALUES = 1_000_000  # positions in a message: some 300 MB
 _NANO = 1_000_000_000
-_MOST_TIME = 2**32  # [s] and [ns]: ROS has 32 bits for each
+_MAX_TIME = 2**32  # [s] and [ns]: ROS has 32 bits for each
 MOST_SECONDS = 2**31
 """Times of messages are less [s]: their seconds are signed integers of 32 bits."""
 _ROWS = ("positions", "velocities", "accelerations")  # of a point
@@ -90,41 +90,44 @@ def to_ros(
     derivatives = check_integer(derivatives, "derivatives", low=0, high=2)
     stamp = check_number(stamp, "stamp", "seconds, at least 0", low=0.0)
     columns = select_columns(motion, joints)
-    knots = _get_knots(motion)[0]
+    knots, all_positions = _get_knots(motion)
     _check_times(stamp, float(knots[-1]))
-    moments = knots
+    times = knots
     if rate is not None:
         rate = _check_rate(rate, knots, len(columns))
         counts = np.maximum(np.ceil(np.diff(knots) * rate - 1e-6), 1.0)
-        moments = divide_intervals(knots, counts.astype(int))
+        times = divide_intervals(knots, counts.astype(int))
     if is_smooth:
         curve = _make_curve(motion, columns)
     else:
-        lines = [np.interp(moments, knots, column) for column in _get_knots(motion)[1].T]
-        positions = np.reshape(lines, (-1, len(moments))).T[:, columns]
-        curve = Curve(moments, positions, _estimate_velocities(moments, positions))
+        lines = [np.interp(times, knots, column) for column in all_positions.T]
+        positions = np.reshape(lines, (-1, len(times))).T[:, columns]
+        curve = Curve(times, positions, _estimate_velocities(times, positions))
     # At the times of the message: its cubics would else exceed limits where knots are close.
-    stated = _round_times(moments)
-    accelerations = curve.acceleration(stated)
-    at_knots = np.searchsorted(moments, curve.times)
+    stated_times = _round_times(times)
+    positions = curve.at(stated_times)
+    velocities = curve.velocity(stated_times)
+    accelerations = curve.acceleration(stated_times)
+    at_knots = np.searchsorted(times, curve.times)
     accelerations[at_knots] = _choose_accelerations(curve, _find_rests(motion, curve.times))
-    parts = [curve.at(stated), curve.velocity(stated), accelerations]
-    for k in range(derivatives + 1, 3):
-        parts[k] = parts[k][:, :0]
-    points = zip(stated.tolist(), *(part.tolist() for part in parts), strict=True)
+    if derivatives < 1:
+        velocities = velocities[:, :0]
+    if derivatives < 2:
+        accelerations = accelerations[:, :0]
+    points = []
+    for k, time in enumerate(stated_times.tolist()):
+        point = {
+            "positions": positions[k].tolist(),
+            "velocities": velocities[k].tolist(),
+            "accelerations": accelerations[k].tolist(),
+            "effort": [],
+            "time_from_start": _make_duration(time),
+        }
+        points.append(point)
     return {
         "header": {"stamp": _make_duration(stamp), "frame_id": frame},
         "joint_names": [motion["names"][k] for k in columns],
-        "points": [
-            {
-                "positions": p,
-                "velocities": v,
-                "accelerations": a,
-                "effort": [],
-                "time_from_start": _make_duration(t),
-            }
-            for t, p, v, a in points
-        ],
+        "points": points,
     }
 
 
@@ -143,18 +146,18 @@ def sample_states(
         shape (T, n) each.
     """
     columns = select_columns(motion, joints)
-    knots = _get_knots(motion)[0]
+    knots, _ = _get_knots(motion)
     rate = _check_rate(rate, knots, len(columns), field="states")
-    is_rest = _find_rests(motion, knots)
-    rests = knots[np.append(is_rest, False) | np.append(False, is_rest)]
+    rests = knots[_find_ends(_find_rests(motion, knots))]
     even = sample_evenly(knots, rate)
-    half = 0.5 / rate
-    after = np.searchsorted(rests, even - half)  # the first that is not well before each
-    is_apart = np.append(rests, np.inf)[after] > even + half
-    moments = _round_times(np.union1d(even[is_apart], rests))
+    half_period = 0.5 / rate
+    # The first rest that is not half a period or more before each time
+    next_rest = np.searchsorted(rests, even - half_period)
+    is_apart = np.append(rests, np.inf)[next_rest] > even + half_period
+    times = _round_times(np.union1d(even[is_apart], rests))
     curve = _make_curve(motion, columns)
     names = [motion["names"][k] for k in columns]
-    return names, moments, curve.at(moments), curve.velocity(moments)
+    return names, times, curve.at(times), curve.velocity(times)
 
 
 def from_ros(
@@ -194,8 +197,8 @@ def from_ros(
     times: list[float] = []
     rows: dict[str, list[Floats | None]] = {key: [] for key in _ROWS}
     for k, point in enumerate(points):
-        for key, found in rows.items():
-            found.append(_read_row(point, key, order, file, k))
+        for key, column in rows.items():
+            column.append(_read_row(point, key, order, file, k))
         times.append(_read_time(point, file, f"points[{k}]."))
     _check_points(times, rows, file)
     size = None if robot_size is None else check_integer(robot_size, "robot_size", low=3)
@@ -207,10 +210,10 @@ def from_ros(
     has_curve = bool((has_velocity[1:] & has_velocity[:-1]).any())
     stated = [row for row in rows["positions"] if row is not None]  # every point has some
     positions: Floats = np.reshape(stated, (len(points), len(names)))
-    waypoints = list(range(len(points)))
     if like is not None:
         waypoints, phases = _place_phases(np.array(times), like, has_curve, file)
     else:
+        waypoints = list(range(len(points)))
         phases = [make_single_phase(len(points))] if len(points) > 1 else []
     motion = {
         "names": names,
@@ -220,11 +223,14 @@ def from_ros(
         "phases": phases,
     }
     if has_curve:
-        knots = interpolate_points(
+        knot_times, knot_positions, knot_rates = interpolate_points(
             np.array(times), positions, rows["velocities"], rows["accelerations"]
         )
-        keys = ("times", "positions", "rates")
-        motion["curve"] = {key: part.tolist() for key, part in zip(keys, knots, strict=True)}
+        motion["curve"] = {
+            "times": knot_times.tolist(),
+            "positions": knot_positions.tolist(),
+            "rates": knot_rates.tolist(),
+        }
     return motion
 
 
@@ -232,16 +238,19 @@ def _place_phases(
     times: Floats, like: Mapping[str, Any], has_curve: bool, file: Path | None
 ) -> tuple[list[int], list[dict[str, Any]]]:
     """Return the points that are waypoints, and the phases of another motion between them."""
-    moments = np.array(like["times"], float)
-    between = (times[1:] + times[:-1]) / 2.0
-    at = np.searchsorted(between, moments - moments[0])  # the points that are nearest in time
+    like_times = np.array(like["times"], float)
+    like_times -= like_times[0]
+    # The points that are nearest in time to the waypoints of `like`
+    middles = (times[1:] + times[:-1]) / 2.0
+    nearest = np.searchsorted(middles, like_times)
     waypoints = np.arange(len(times))
     if has_curve:
-        waypoints = np.union1d(at, waypoints[[0, -1]])
-        at = np.searchsorted(waypoints, at)
-    edges = at[[0, *(phase["last"] for phase in like["phases"])]].tolist()
-    ends = moments[[phase["last"] for phase in like["phases"]]] - moments[0]
+        waypoints = np.union1d(nearest, waypoints[[0, -1]])
+        nearest = np.searchsorted(waypoints, nearest)
+    last_of_phases = [phase["last"] for phase in like["phases"]]
+    edges = nearest[[0, *last_of_phases]].tolist()
     if edges[-1] != len(waypoints) - 1 or (np.diff(edges) <= 0).any():
+        ends = like_times[last_of_phases]
         raise InputError(
             "there are no points at the times at which the phases of `like` end",
             file=file,
@@ -249,8 +258,9 @@ def _place_phases(
             expected=f"points at {format_value(ends.round(3).tolist())} s",
             got=f"{len(times)} points from {times[0]:.3f} to {times[-1]:.3f} s",
         )
-    spans = zip(like["phases"], edges, edges[1:], strict=False)
-    phases = [{**phase, "first": first, "last": last} for phase, first, last in spans]
+    phases = []
+    for phase, first, last in zip(like["phases"], edges, edges[1:], strict=False):
+        phases.append({**phase, "first": first, "last": last})
     return waypoints.tolist(), phases
 
 
@@ -267,22 +277,30 @@ def _get_knots(motion: Mapping[str, Any]) -> tuple[Floats, Floats]:
 
 def _make_curve(motion: Mapping[str, Any], columns: Sequence[int]) -> Curve:
     """Return the curve of some coordinates, or else monotone cubics through the waypoints."""
-    times, every = _get_knots(motion)
-    positions = every[:, columns]
+    times, all_positions = _get_knots(motion)
+    positions = all_positions[:, columns]
     if motion.get("curve") is None:
         return Curve(times, positions, _estimate_velocities(times, positions))
-    return Curve(times, positions, np.array(motion["curve"]["rates"], float)[:, columns])
+    rates = np.array(motion["curve"]["rates"], float)
+    return Curve(times, positions, rates[:, columns])
 
 
 def _find_rests(motion: Mapping[str, Any], times: Floats) -> Bools:
     """Return whether nothing moves, robot or object, between each of the times and the next [s]."""
-    knots, every = _get_knots(motion)
-    is_still: Bools = np.logical_not(np.diff(every, axis=0).any(axis=1))
+    knots, positions = _get_knots(motion)
+    is_still: Bools = np.logical_not(np.diff(positions, axis=0).any(axis=1))
     if motion.get("curve") is not None:
         at_rest = ~np.any(motion["curve"]["rates"], axis=1)
         is_still &= at_rest[:-1] & at_rest[1:]
     middles = (times[1:] + times[:-1]) / 2.0
     return np.asarray(is_still[np.searchsorted(knots, middles) - 1])
+
+
+def _find_ends(is_rest: Bools) -> Bools:
+    """Return whether each of K knots begins or ends one of the intervals that rest, shape (K,)."""
+    begins = np.append(is_rest, False)
+    ends = np.append(False, is_rest)
+    return np.asarray(begins | ends)
 
 
 def _check_times(stamp: float, duration: float) -> None:
@@ -297,10 +315,10 @@ def _check_times(stamp: float, duration: float) -> None:
 
 def _check_rate(rate: float, times: Floats, columns: int, *, field: str = "rate") -> float:
     rate = check_number(rate, field, "points a second, more than 0", low=0.0, strict=True)
-    most = _MAX_VALUES // max(columns, 1)  # a group may be empty
+    max_points = _MAX_VALUES // max(columns, 1)  # a group may be empty
     duration = times[-1] - times[0]
-    if duration * rate > most:
-        expected = f"at most {most} points, {most / duration:.4g} a second "
+    if duration * rate > max_points:
+        expected = f"at most {max_points} points, {max_points / duration:.4g} a second "
         expected += f"for this motion of {duration:.4g} s"
         raise InputError("too many points", field=field, expected=expected, got=rate)
     return rate
@@ -336,7 +354,7 @@ def _choose_accelerations(curve: Curve, is_rest: Bools) -> Floats:
     chosen = np.concatenate([after[:1], before])
     inner = before[:-1] * squares[:-1] + after[1:] * squares[1:]
     chosen[1:-1] = inner / (squares[:-1] + squares[1:])
-    chosen[np.append(is_rest, False) | np.append(False, is_rest)] = 0.0
+    chosen[_find_ends(is_rest)] = 0.0
     return chosen
 
 
@@ -357,21 +375,31 @@ def _sort_names(names: list[Any], like: Mapping[str, Any] | None, file: Path | N
             raise UnknownNameError("coordinate", name, known, file=file, field=f"joint_names[{k}]")
     missing = [name for name in known[: like["robot_size"]] if name not in names]
     if missing:
-        problem, expected = "coordinates of the robot are missing", ", ".join(missing)
-        raise InputError(problem, file=file, field="joint_names", expected=expected, got=names)
+        raise InputError(
+            "coordinates of the robot are missing",
+            file=file,
+            field="joint_names",
+            expected=", ".join(missing),
+            got=names,
+        )
     return sorted(range(len(names)), key=lambda k: known.index(names[k]))
 
 
 def _read_time(point: Any, file: Path | None, where: str) -> float:
     since = _get_field(point, "time_from_start", dict, file, where)
     inside = f"{where}time_from_start."
-    found = {key: _get_field(since, key, int, file, inside) for key in ("sec", "nanosec")}
-    for key, value in found.items():
-        if not abs(value) < _MOST_TIME:
-            expected, got = f"less than {_MOST_TIME}", format_value(value)
-            field = inside + key
-            raise InputError("out of range", file=file, field=field, expected=expected, got=got)
-    return float(found["sec"] + found["nanosec"] / _NANO)
+    sec = _get_field(since, "sec", int, file, inside)
+    nanosec = _get_field(since, "nanosec", int, file, inside)
+    for key, value in (("sec", sec), ("nanosec", nanosec)):
+        if not abs(value) < _MAX_TIME:
+            raise InputError(
+                "out of range",
+                file=file,
+                field=inside + key,
+                expected=f"less than {_MAX_TIME}",
+                got=format_value(value),
+            )
+    return float(sec + nanosec / _NANO)
 
 
 def _read_row(
@@ -386,14 +414,21 @@ def _read_row(
         return None
     field = where + key
     if len(values) != len(order):
-        problem, count = "wrong number of values", len(order)
-        raise InputError(problem, file=file, field=field, expected=count, got=len(values))
+        raise InputError(
+            "wrong number of values",
+            file=file,
+            field=field,
+            expected=len(order),
+            got=len(values),
+        )
     for k, value in enumerate(values):
         if not is_number(value) or not abs(value) <= _LARGEST:
-            expected = f"a number up to {_LARGEST:g}"
-            got = format_value(value)
             raise InputError(
-                "not a number", file=file, field=f"{field}[{k}]", expected=expected, got=got
+                "not a number",
+                file=file,
+                field=f"{field}[{k}]",
+                expected=f"a number up to {_LARGEST:g}",
+                got=format_value(value),
             )
     return np.array([values[k] for k in order], float)
 
@@ -403,13 +438,14 @@ def _check_points(
 ) -> None:
     """Check that times increase, and that controllers can interpolate between the points."""
     for k in range(1, len(times)):
-        where = f"points[{k}]"
-        if not times[k] - times[k - 1] >= MIN_INTERVAL / 2.0:  # half, against rounding
-            field = f"{where}.time_from_start"
-            expected = f"more than {times[k - 1]:.9f} s"
-            got = f"{times[k]:.9f} s"
+        # Half of the shortest interval, since times are rounded.
+        if not times[k] - times[k - 1] >= MIN_INTERVAL / 2.0:
             raise InputError(
-                "times do not increase", file=file, field=field, expected=expected, got=got
+                "times do not increase",
+                file=file,
+                field=f"points[{k}].time_from_start",
+                expected=f"more than {times[k - 1]:.9f} s",
+                got=f"{times[k]:.9f} s",
             )
         ends = slice(k - 1, k + 1)
         has_velocities = all(row is not None for row in rows["velocities"][ends])
@@ -435,7 +471,13 @@ def _get_field(data: Any, key: str, kind: type, file: Path | None, where: str) -
         problem = "this is missing from a JointTrajectory"
         raise InputError(problem, file=file, field=where + key, expected=expected)
     value = data[key]
-    if not isinstance(value, Mapping if kind is dict else kind) or isinstance(value, bool):
-        got, problem = format_value(value), "wrong type of value"
-        raise InputError(problem, file=file, field=where + key, expected=expected, got=got)
+    has_kind = isinstance(value, Mapping if kind is dict else kind)
+    if not has_kind or isinstance(value, bool):
+        raise InputError(
+            "wrong type of value",
+            file=file,
+            field=where + key,
+            expected=expected,
+            got=format_value(value),
+        )
     return value

@@ -10,9 +10,9 @@ import contextlib
 import json
 import math
 import sqlite3
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -74,23 +74,27 @@ def write_rosbag(
     from rosbags.typesys import Stores, get_typestore
 
     states = check_number(states, "states", "messages a second, more than 0", low=0.0, strict=True)
-    begin = _check_namespace(namespace)
+    prefix = _check_namespace(namespace)
     store: Any = get_typestore(Stores.ROS2_HUMBLE)
-    own = check_text(base_frame, "base_frame")
-    messages = _make_messages(
-        motion, store.types, rate, states, frame=frame, base_frame=own, stamp=stamp
+    base_frame = check_text(base_frame, "base_frame")
+    messages = list(
+        _make_messages(
+            motion, store.types, rate, states, frame=frame, base_frame=base_frame, stamp=stamp
+        )
     )
-    found = sorted(messages, key=lambda item: item[1])
+    messages.sort(key=lambda message: message.time)
+    used_topics = {message.topic for message in messages}
     with write_folder_atomically(path, force=force) as staging, _report_database_errors(path):
         inside = staging / Path(path).absolute().name  # names the database
         with Writer(inside, version=_FORMAT) as writer:
-            ends = [end for end in TOPICS if any(end == own for own, _, _ in found)]
-            topics = {
-                end: writer.add_connection(f"{begin}/{end}", TOPICS[end], typestore=store)
-                for end in ends
-            }
-            for end, when, message in found:
-                writer.write(topics[end], when, bytes(store.serialize_cdr(message, TOPICS[end])))
+            connections = {}
+            for topic, kind in TOPICS.items():
+                if topic in used_topics:
+                    name = f"{prefix}/{topic}"
+                    connections[topic] = writer.add_connection(name, kind, typestore=store)
+            for topic, time, content in messages:
+                data = bytes(store.serialize_cdr(content, TOPICS[topic]))
+                writer.write(connections[topic], time, data)
         for file in inside.iterdir():
             file.rename(staging / file.name)
         inside.rmdir()
@@ -111,11 +115,24 @@ def import_rosbags() -> Any:
 
 
 def _check_namespace(name: str) -> str:
-    parts = check_text(name, "namespace").strip("/").split("/") if name != "" else [""]
-    if parts != [""] and not all(part.isascii() and part.isidentifier() for part in parts):
+    """Return a namespace with a slash before each of its words; none for an empty one."""
+    if name == "":
+        return ""
+    words = check_text(name, "namespace").strip("/").split("/")
+    if words == [""]:
+        return ""
+    if not all(word.isascii() and word.isidentifier() for word in words):
         expected = "words separated by slashes, e.g. /vkc"
         raise InputError("not a topic name", field="namespace", expected=expected, got=name)
-    return "".join(f"/{part}" for part in parts if part)
+    return "".join(f"/{word}" for word in words)
+
+
+class _Message(NamedTuple):
+    """Suffix of the topic, time of recording [ns], and content."""
+
+    topic: str
+    time: int
+    content: Any
 
 
 def _make_messages(
@@ -127,8 +144,7 @@ def _make_messages(
     frame: str,
     base_frame: str,
     stamp: float,
-) -> Iterator[tuple[str, int, Any]]:
-    """Yield suffix of the topic, time of recording [ns] and message."""
+) -> Iterator[_Message]:
     base = to_ros(motion, joints="base", rate=rate, frame=frame, stamp=stamp)
     begin = _count_nanoseconds(base["header"]["stamp"])
     duration = _count_nanoseconds(base["points"][-1]["time_from_start"])
@@ -137,74 +153,86 @@ def _make_messages(
         expected = f"seconds, less than 2^31 − {duration / _NANO:.4g}"
         raise InputError(problem, field="stamp", expected=expected, got=stamp)
     arm = to_ros(motion, joints="arm", rate=rate, frame=frame, stamp=stamp)
-    for end, found in (("arm/joint_trajectory", arm), ("base/joint_trajectory", base)):
-        if found["joint_names"]:
-            yield end, begin, _make_trajectory(types, found)
-    header, stamped = types["std_msgs/msg/Header"], types["geometry_msgs/msg/PoseStamped"]
-    poses = [
-        stamped(
-            header(_make_time(types, begin + _count_nanoseconds(p["time_from_start"])), frame),
-            _make_pose(types, p),
-        )
-        for p in base["points"]
-    ]
-    yield (
-        "base/path",
-        begin,
-        types["nav_msgs/msg/Path"](header(_make_time(types, begin), frame), poses),
-    )
+    if arm["joint_names"]:
+        yield _Message("arm/joint_trajectory", begin, _make_trajectory(types, arm))
+    if base["joint_names"]:
+        yield _Message("base/joint_trajectory", begin, _make_trajectory(types, base))
+    yield _Message("base/path", begin, _make_path(types, base["points"], begin, frame))
     _, times, positions, velocities = sample_states(motion, "base", states)
     for time, pose, velocity in zip(times, positions, velocities, strict=True):
-        when = begin + round(time * _NANO)
-        twist = _make_twist(types, pose[2], velocity, header(_make_time(types, when), base_frame))
-        yield "base/cmd_vel", when, twist
+        recorded = begin + round(time * _NANO)
+        header = _make_header(types, recorded, base_frame)
+        twist = _make_twist(types, pose[2], velocity, header)
+        yield _Message("base/cmd_vel", recorded, twist)
     names, times, positions, velocities = sample_states(motion, "objects", states)
     for time, position, velocity in zip(times, positions, velocities, strict=True):
         if not names:
             break
-        when = begin + round(time * _NANO)
-        state = types["sensor_msgs/msg/JointState"](
-            header(_make_time(types, when), frame), names, position, velocity, np.empty(0)
-        )
-        yield "objects/joint_states", when, state
+        recorded = begin + round(time * _NANO)
+        header = _make_header(types, recorded, frame)
+        no_efforts = np.empty(0)
+        state = types["sensor_msgs/msg/JointState"](header, names, position, velocity, no_efforts)
+        yield _Message("objects/joint_states", recorded, state)
     for phase in motion["phases"]:
-        when = begin + round((motion["times"][phase["first"]] - motion["times"][0]) * _NANO)
-        yield "phases", when, types["std_msgs/msg/String"](json.dumps(phase))
+        seconds = motion["times"][phase["first"]] - motion["times"][0]
+        recorded = begin + round(seconds * _NANO)
+        yield _Message("phases", recorded, types["std_msgs/msg/String"](json.dumps(phase)))
 
 
-def _make_trajectory(types: Any, found: Mapping[str, Any]) -> Any:
-    header, duration = found["header"], types["builtin_interfaces/msg/Duration"]
-    kind = types["trajectory_msgs/msg/JointTrajectoryPoint"]
-    keys = ("positions", "velocities", "accelerations", "effort")
-    points = [
-        kind(*(np.array(point[key], float) for key in keys), duration(**point["time_from_start"]))
-        for point in found["points"]
-    ]
-    named = types["std_msgs/msg/Header"](
-        _make_time(types, _count_nanoseconds(header["stamp"])), header["frame_id"]
-    )
-    return types["trajectory_msgs/msg/JointTrajectory"](named, found["joint_names"], points)
+def _make_trajectory(types: Any, data: Mapping[str, Any]) -> Any:
+    make_point = types["trajectory_msgs/msg/JointTrajectoryPoint"]
+    make_duration = types["builtin_interfaces/msg/Duration"]
+    points = []
+    for point in data["points"]:
+        numbers = make_point(
+            np.array(point["positions"], float),
+            np.array(point["velocities"], float),
+            np.array(point["accelerations"], float),
+            np.array(point["effort"], float),
+            make_duration(**point["time_from_start"]),
+        )
+        points.append(numbers)
+    stamp = _count_nanoseconds(data["header"]["stamp"])
+    header = _make_header(types, stamp, data["header"]["frame_id"])
+    return types["trajectory_msgs/msg/JointTrajectory"](header, data["joint_names"], points)
+
+
+def _make_path(types: Any, points: Sequence[Mapping[str, Any]], begin: int, frame: str) -> Any:
+    make_stamped = types["geometry_msgs/msg/PoseStamped"]
+    poses = []
+    for point in points:
+        time = begin + _count_nanoseconds(point["time_from_start"])
+        poses.append(make_stamped(_make_header(types, time, frame), _make_pose(types, point)))
+    return types["nav_msgs/msg/Path"](_make_header(types, begin, frame), poses)
 
 
 def _make_pose(types: Any, point: Mapping[str, Any]) -> Any:
     x, y, yaw = point["positions"]
-    turn = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, math.sin(yaw / 2.0), math.cos(yaw / 2.0))
-    return types["geometry_msgs/msg/Pose"](types["geometry_msgs/msg/Point"](x, y, 0.0), turn)
+    position = types["geometry_msgs/msg/Point"](x, y, 0.0)
+    # A rotation by yaw about z
+    sine = math.sin(yaw / 2.0)
+    cosine = math.cos(yaw / 2.0)
+    orientation = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, sine, cosine)
+    return types["geometry_msgs/msg/Pose"](position, orientation)
 
 
 def _make_twist(types: Any, yaw: float, velocity: Floats, header: Any) -> Any:
     """Return a velocity of the base in its own frame."""
-    vx, vy, turn = velocity.tolist()
-    c, s = math.cos(yaw), math.sin(yaw)
-    vector = types["geometry_msgs/msg/Vector3"]
-    linear, angular = vector(c * vx + s * vy, c * vy - s * vx, 0.0), vector(0.0, 0.0, turn)
+    vx, vy, yaw_rate = velocity.tolist()
+    c = math.cos(yaw)
+    s = math.sin(yaw)
+    make_vector = types["geometry_msgs/msg/Vector3"]
+    linear = make_vector(c * vx + s * vy, c * vy - s * vx, 0.0)
+    angular = make_vector(0.0, 0.0, yaw_rate)
     twist = types["geometry_msgs/msg/Twist"](linear, angular)
     return types["geometry_msgs/msg/TwistStamped"](header, twist)
 
 
-def _make_time(types: Any, nanoseconds: int) -> Any:
-    return types["builtin_interfaces/msg/Time"](*divmod(nanoseconds, _NANO))
+def _make_header(types: Any, nanoseconds: int, frame: str) -> Any:
+    seconds, rest = divmod(nanoseconds, _NANO)
+    stamp = types["builtin_interfaces/msg/Time"](seconds, rest)
+    return types["std_msgs/msg/Header"](stamp, frame)
 
 
-def _count_nanoseconds(when: Mapping[str, int]) -> int:
-    return when["sec"] * _NANO + when["nanosec"]
+def _count_nanoseconds(time: Mapping[str, int]) -> int:
+    return time["sec"] * _NANO + time["nanosec"]

@@ -14,7 +14,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 from vkc_pin.errors import InputError, UnknownNameError, format_value
 from vkc_pin.utils.arguments import check_integer, check_list, check_mapping, check_text
@@ -25,9 +25,13 @@ from vkc_pin.world.files.writing import write_atomically
 GROUPS = ("all", "robot", "base", "arm", "objects")
 """Groups of coordinates: all, base and arm, base, arm, or joints of objects."""
 _MAX_BYTES = 20_000_000  # of a file: about 30 000 waypoints of 25 coordinates
-_MAX_LINES, _MAX_COLUMNS = 200_000, 1000
-_TIME, _PHASES = "time", ("phase", "phase_name", "held")  # first and last columns of a table
-_RATE, _WAYPOINT = " velocity", "waypoint"  # additional columns of a curve
+_MAX_LINES = 200_000
+_MAX_COLUMNS = 1000
+_TIME = "time"  # first column of a table
+_PHASES = ("phase", "phase_name", "held")  # last columns of a table
+# Additional columns of a curve: ends of the names of velocities, and name of the last column
+_RATE = " velocity"
+_WAYPOINT = "waypoint"
 _BASE = ("base_x", "base_y", "base_yaw")  # of any robot
 _OPENING = "opening"  # additional last column if a phase states a gripper opening
 
@@ -59,55 +63,80 @@ def write_csv(
     Raises:
         UnknownNameError: There is no such group or coordinate.
     """
-    columns, phases = select_columns(motion, joints), motion["phases"]
-    known = dict(zip(motion["names"], ("m", "m", "rad"), strict=False))
+    columns = select_columns(motion, joints)
+    known_units = dict(zip(motion["names"], ("m", "m", "rad"), strict=False))
     expected = "names of coordinates, each with its unit"
     for name, unit in check_mapping({} if units is None else units, "units", expected).items():
-        known[name] = check_text(unit, f"units[{name!r}]")
+        known_units[name] = check_text(unit, f"units[{name!r}]")
+    phases = motion["phases"]
+    has_openings = any(phase.get(_OPENING) is not None for phase in phases)
+    header = [f"{_TIME} [s]"]
+    header += _name_columns(motion, columns, known_units)
+    header += _PHASES
+    if has_openings:
+        header.append(f"{_OPENING} [m]")
     lines: list[str] = []
     # The writer ends lines with "\r\n", so that it quotes names with either character.
     table = csv.writer(SimpleNamespace(write=lines.append))
-    names = [motion["names"][k] for k in columns]
-    header = [f"{name} [{known[name]}]" if name in known else name for name in names]
-    if motion.get("curve") is not None:
-        header += [
-            name + _RATE + (f" [{known[name]}/s]" if name in known else "") for name in names
-        ]
-        header.append(_WAYPOINT)
-    has_openings = any(phase.get(_OPENING) is not None for phase in phases)
-    openings = [f"{_OPENING} [m]"] if has_openings else []
-    table.writerow([f"{_TIME} [s]", *header, *_PHASES, *openings])
+    table.writerow(header)
     number = 0
     for time, waypoint, values in _list_rows(motion, columns):
-        number += waypoint > phases[number]["last"]
+        if waypoint > phases[number]["last"]:
+            number += 1
         phase = phases[number]
-        held, deviation = dict(phase["held"]), phase.get("deviation") or {}
-        for name in phase["by"].keys() | deviation.keys():
-            own = [deviation[name]] if name in deviation else []
-            held[name] = [held[name], phase["by"].get(name), *own]
+        cells = [repr(float(time)), *values, number + 1, phase["name"], _format_holds(phase)]
         if has_openings:
             opening = phase.get(_OPENING)
-            openings = ["" if opening is None else repr(float(opening))]
-        cells = [number + 1, phase["name"], json.dumps(held), *openings]
-        table.writerow([repr(float(time)), *values, *cells])
+            cells.append("" if opening is None else repr(float(opening)))
+        table.writerow(cells)
     text = "".join(line.removesuffix("\r\n") + "\n" for line in lines)
     return write_atomically(path, text.encode("utf-8"))
+
+
+def _name_columns(
+    motion: Mapping[str, Any], columns: Sequence[int], units: Mapping[str, str]
+) -> list[str]:
+    """Return the names of columns of coordinates, with their units where they are known."""
+    names = [motion["names"][k] for k in columns]
+    header = [f"{name} [{units[name]}]" if name in units else name for name in names]
+    if motion.get("curve") is not None:
+        for name in names:
+            unit = f" [{units[name]}/s]" if name in units else ""
+            header.append(name + _RATE + unit)
+        header.append(_WAYPOINT)
+    return header
+
+
+def _format_holds(phase: Mapping[str, Any]) -> str:
+    """Return the holds of a phase as JSON; see `_parse_holds`."""
+    held = dict(phase["held"])
+    deviation = phase.get("deviation") or {}
+    for name in phase["by"].keys() | deviation.keys():
+        hold = [held[name], phase["by"].get(name)]
+        if name in deviation:
+            hold.append(deviation[name])
+        held[name] = hold
+    return json.dumps(held)
 
 
 def _list_rows(
     motion: Mapping[str, Any], columns: Sequence[int]
 ) -> Iterator[tuple[float, int, list[str]]]:
     """Yield time, present or next waypoint, and cells of every line."""
-    waypoint, curve = 0, motion.get("curve")
+    curve = motion.get("curve")
     source = motion if curve is None else curve
+    last = len(motion["times"]) - 1
+    waypoint = 0
     for k, (time, row) in enumerate(zip(source["times"], source["positions"], strict=True)):
         cells = [repr(float(row[column])) for column in columns]
         is_waypoint = time == motion["times"][waypoint]
         if curve is not None:
-            cells += [repr(float(curve["rates"][k][column])) for column in columns]
-            cells.append(str(int(is_waypoint)))
+            rates = curve["rates"][k]
+            cells += [repr(float(rates[column])) for column in columns]
+            cells.append("1" if is_waypoint else "0")
         yield time, waypoint, cells
-        waypoint = min(waypoint + is_waypoint, len(motion["times"]) - 1)
+        if is_waypoint and waypoint < last:
+            waypoint += 1
 
 
 def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, Any]:
@@ -121,72 +150,113 @@ def read_csv(path: str | Path, *, robot_size: int | None = None) -> dict[str, An
     """
     path = check_path(path, "path")
     table = read_text(path, "CSV", _MAX_BYTES)
-    if (many := table.count("\n")) > _MAX_LINES:
-        raise InputError("too many lines", file=path, expected=f"at most {_MAX_LINES}", got=many)
+    count = table.count("\n")
+    if count > _MAX_LINES:
+        raise InputError("too many lines", file=path, expected=f"at most {_MAX_LINES}", got=count)
     lines = _read_lines(table, path)
-    header = _check_header(next(lines, (0, []))[1], path)
-    has_openings = tuple(header[-4:]) == (*_PHASES, _OPENING)
-    has_phases = has_openings or tuple(header[-3:]) == _PHASES
-    last = len(header) - (len(_PHASES) + has_openings if has_phases else 0)
-    names, is_curve = header[1:last], _has_rates(header[1:last])
-    is_marked = is_curve and names[-1] == _WAYPOINT
-    if is_curve:
-        names = _check_rate_columns(names[: len(names) - is_marked], path)
-    own = slice(1, len(names) + 1)
+    _, first_line = next(lines, (0, []))
+    header = _check_header(first_line, path)
+    layout = _find_layout(header, path)
+    names = layout.names
     rows: list[list[float]] = []
     knots: list[list[float]] = []
     phases: list[dict[str, Any]] = []
-    for number, cells in lines:
+    for line, cells in lines:
         if not cells:
             continue
         if len(cells) != len(header):
-            problem, count = "wrong number of columns", len(header)
-            raise InputError(problem, file=path, line=number, expected=count, got=len(cells))
-        row = [
-            _parse_number(cell, path, number, name)
-            for cell, name in zip(cells[:last], header, strict=False)
-        ]
-        if has_phases:
-            opening = cells[-1] if has_openings else ""
-            stated = {_OPENING: _parse_number(opening, path, number, _OPENING)} if opening else {}
+            raise InputError(
+                "wrong number of columns",
+                file=path,
+                line=line,
+                expected=len(header),
+                got=len(cells),
+            )
+        row = list[float]()
+        for cell, name in zip(cells[: layout.number_count], header, strict=False):
+            row.append(_parse_number(cell, path, line, name))
+        if layout.has_phases:
             # This row is the next waypoint, or leads there.
-            _add_phase(phases, cells[last : last + 3], stated, len(rows), path, number)
+            _add_phase(phases, cells[layout.number_count :], len(rows), path, line)
         knots.append(row)
-        if not is_marked or row[-1]:
+        if not layout.is_marked or row[-1]:
             rows.append(row)
-    if not has_phases and len(rows) > 1:
+    if not layout.has_phases and len(rows) > 1:
         phases = [make_single_phase(len(rows))]
     if robot_size is None:
         robot_size = infer_robot_size(names, file=path, line=1)
     else:
         robot_size = check_integer(robot_size, "robot_size", low=3)
+    # Columns of a row: time, positions, and rates of a curve.
+    first_rate = 1 + len(names)
     motion = {
         "names": names,
         "times": [row[0] for row in rows],
-        "positions": [row[own] for row in rows],
+        "positions": [row[1:first_rate] for row in rows],
         "robot_size": robot_size,
         "phases": phases,
     }
-    if is_curve:
+    if layout.is_curve:
         motion["curve"] = {
             "times": [knot[0] for knot in knots],
-            "positions": [knot[own] for knot in knots],
-            "rates": [knot[own.stop : own.stop + len(names)] for knot in knots],
+            "positions": [knot[1:first_rate] for knot in knots],
+            "rates": [knot[first_rate : first_rate + len(names)] for knot in knots],
         }
     return motion
+
+
+class _Layout(NamedTuple):
+    """Columns of a table: numbers, then the cells of a phase.
+
+    Attributes:
+        names: Names of the coordinates.
+        number_count: Number of columns with numbers.
+        has_phases: Whether cells of a phase follow: its number, name and holds, and an opening.
+        is_curve: Whether positions are followed by velocities.
+        is_marked: Whether the last number tells waypoints from other knots.
+    """
+
+    names: list[str]
+    number_count: int
+    has_phases: bool
+    is_curve: bool
+    is_marked: bool
+
+
+def _find_layout(header: list[str], path: Path) -> _Layout:
+    """Return the columns of a table with a header."""
+    has_openings = tuple(header[-4:]) == (*_PHASES, _OPENING)
+    has_phases = has_openings or tuple(header[-3:]) == _PHASES
+    number_count = len(header)
+    if has_phases:
+        number_count -= len(_PHASES)
+    if has_openings:
+        number_count -= 1
+    names = header[1:number_count]
+    is_curve = _has_rates(names)
+    is_marked = is_curve and names[-1] == _WAYPOINT
+    if is_curve:
+        names = _check_rate_columns(names[:-1] if is_marked else names, path)
+    return _Layout(names, number_count, has_phases, is_curve, is_marked)
 
 
 def _check_header(cells: list[str], path: Path) -> list[str]:
     """Return the column names of a table without their units."""
     if len(cells) > _MAX_COLUMNS:
-        most = f"at most {_MAX_COLUMNS}"
-        raise InputError("too many columns", file=path, line=1, expected=most, got=len(cells))
+        expected = f"at most {_MAX_COLUMNS}"
+        raise InputError("too many columns", file=path, line=1, expected=expected, got=len(cells))
     header = [re.sub(r" \[(s|m|rad|m/s|rad/s)\]$", "", name) for name in cells]
     if not header:
         raise InputError("an empty file", file=path, expected="a table with a line of names")
     if header[0] != _TIME:
-        problem, got = "not a table of waypoints", format_value(header[0])
-        raise InputError(problem, file=path, line=1, field="first column", expected=_TIME, got=got)
+        raise InputError(
+            "not a table of waypoints",
+            file=path,
+            line=1,
+            field="first column",
+            expected=_TIME,
+            got=format_value(header[0]),
+        )
     return header
 
 
@@ -199,7 +269,8 @@ def _has_rates(columns: list[str]) -> bool:
 def _check_rate_columns(columns: list[str], path: Path) -> list[str]:
     """Return the coordinates of a curve's columns, which are followed by their velocities."""
     half = len(columns) // 2
-    names, rates = columns[:half], columns[half:]
+    names = columns[:half]
+    rates = columns[half:]
     expected = [name + _RATE for name in names]
     if rates != expected:
         raise InputError(
@@ -214,7 +285,8 @@ def _check_rate_columns(columns: list[str], path: Path) -> list[str]:
 
 def write_json(motion: Mapping[str, Any], path: str | Path) -> Path:
     """Write a motion atomically as JSON; return the path."""
-    return write_atomically(path, (json.dumps(motion, indent=1) + "\n").encode("utf-8"))
+    text = json.dumps(motion, indent=1) + "\n"
+    return write_atomically(path, text.encode("utf-8"))
 
 
 def read_json(path: str | Path) -> Any:
@@ -225,18 +297,20 @@ def read_json(path: str | Path) -> Any:
 
 def select_columns(motion: Mapping[str, Any], joints: str | Sequence[str]) -> list[int]:
     """Select columns of a motion by one of `GROUPS`, or by names in the wanted order."""
-    known, robot, size = motion["names"], motion["robot_size"], len(motion["names"])
+    known = motion["names"]
+    size = len(known)
+    robot_size = motion["robot_size"]
     groups = {
-        "all": (0, size),
-        "robot": (0, robot),
-        "base": (0, 3),
-        "arm": (3, robot),
-        "objects": (robot, size),
+        "all": range(size),
+        "robot": range(robot_size),
+        "base": range(3),
+        "arm": range(3, robot_size),
+        "objects": range(robot_size, size),
     }
     if isinstance(joints, str):
         if joints not in groups:
             raise UnknownNameError("group of joints", joints, GROUPS, field="joints")
-        return list(range(*groups[joints]))
+        return list(groups[joints])
     names = check_list(joints, "joints", f"one of {', '.join(GROUPS)}, or a list of names", str)
     if not names:
         raise InputError(
@@ -267,13 +341,16 @@ def infer_robot_size(names: Sequence[str], **where: Any) -> int:
     if tuple(names[:3]) != _BASE:
         expected = f"{', '.join(_BASE)} first, or the argument robot_size"
         raise InputError("no base coordinates", expected=expected, got=tuple(names[:3]), **where)
-    has_dot = ["." in str(name) for name in names]
-    size = has_dot.index(True) if True in has_dot else len(names)
-    if not all(has_dot[size:]):
-        first, late = names[size], names[size + has_dot[size:].index(False)]
-        expected = f"joints of the robot before those of objects such as {format_value(first)}, "
-        expected += "or the argument robot_size"
-        raise InputError("not in order", expected=expected, got=format_value(late), **where)
+    size = len(names)
+    for k, name in enumerate(names):
+        has_dot = "." in str(name)
+        if has_dot and size == len(names):
+            size = k
+        if not has_dot and k > size:
+            first = format_value(names[size])
+            expected = f"joints of the robot before those of objects such as {first}, or the "
+            expected += "argument robot_size"
+            raise InputError("not in order", expected=expected, got=format_value(name), **where)
     return size
 
 
@@ -298,9 +375,13 @@ def _parse_number(cell: str, path: Path, line: int, column: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        expected, got = "a finite number", format_value(cell)
         raise InputError(
-            "not a number", file=path, line=line, field=column, expected=expected, got=got
+            "not a number",
+            file=path,
+            line=line,
+            field=column,
+            expected="a finite number",
+            got=format_value(cell),
         )
     return value
 
@@ -308,21 +389,30 @@ def _parse_number(cell: str, path: Path, line: int, column: str) -> float:
 def _add_phase(
     phases: list[dict[str, Any]],
     cells: Sequence[str],
-    opening: dict[str, float],
     row: int,
     path: Path,
     line: int,
 ) -> None:
-    """Parse a line's phase cells (number, name, holds) and add or extend the phase.
+    """Parse a line's phase cells (number, name, holds, opening) and add or extend the phase.
 
     A waypoint between two phases belongs to the earlier one. All lines of a phase must agree.
     """
-    number, name, held = cells
-    expected = f"{len(phases)} or {len(phases) + 1}" if phases else "1"
-    if number not in expected.split(" or "):
-        problem, got = "not the next phase", format_value(number)
-        raise InputError(problem, file=path, line=line, field="phase", expected=expected, got=got)
-    details = {"name": name, **_parse_holds(held, path, line), **opening}
+    number, name, held, *openings = cells
+    stated_openings = {}
+    for opening in openings:
+        if opening:
+            stated_openings[_OPENING] = _parse_number(opening, path, line, _OPENING)
+    expected_numbers = [str(len(phases)), str(len(phases) + 1)] if phases else ["1"]
+    if number not in expected_numbers:
+        raise InputError(
+            "not the next phase",
+            file=path,
+            line=line,
+            field="phase",
+            expected=" or ".join(expected_numbers),
+            got=format_value(number),
+        )
+    details = {"name": name, **_parse_holds(held, path, line), **stated_openings}
     if int(number) > len(phases):
         phases.append({**details, "first": max(row - 1, 0), "last": row})
         return
@@ -341,20 +431,28 @@ def _add_phase(
 
 def _parse_holds(held: str, path: Path, line: int) -> dict[str, Any]:
     """Return the holds of a phase as in a motion's data."""
+    attachments = {}
+    by = {}
+    deviation = {}
     try:
-        items = json.loads(held).items()
-        rows = {name: [hold, None] if isinstance(hold, str) else hold for name, hold in items}
-        at = {name: row[0] for name, row in rows.items()}
-        by = {name: row[1] for name, row in rows.items() if row[1] is not None}
-        deviation = {name: row[2] for name, row in rows.items() if len(row) > 2}
+        for name, hold in json.loads(held).items():
+            # Attachment, grasping frame and deviation; the attachment alone without the others.
+            row = [hold, None] if isinstance(hold, str) else hold
+            attachments[name] = row[0]
+            if row[1] is not None:
+                by[name] = row[1]
+            if len(row) > 2:
+                deviation[name] = row[2]
     except (ValueError, AttributeError, TypeError, LookupError, RecursionError):
-        problem, expected = "not the held objects", 'JSON such as {"door": "handle"}'
         raise InputError(
-            problem,
+            "not the held objects",
             file=path,
             line=line,
             field="held",
-            expected=expected,
+            expected='JSON such as {"door": "handle"}',
             got=format_value(held),
         ) from None
-    return {"held": at, "by": by, **({"deviation": deviation} if deviation else {})}
+    data = {"held": attachments, "by": by}
+    if deviation:
+        data["deviation"] = deviation
+    return data

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -33,12 +32,21 @@ from vkc_pin.utils.parallel import CrashedTask, run_tasks
 from vkc_pin.validation.validate import validate
 from vkc_pin.world.files.writing import check_inside, check_writable, write_atomically
 
-_LISTED = 20  # problems in the text
-_PICTURES = 10  # episodes on the statistics page
-_RENDERED = 3  # episodes of which the first, middle and last images are rendered again
-_COLOUR_TOLERANCE, _DEPTH_TOLERANCE = 16, 10  # of a pixel: of 255 levels, and [mm]
-_PIXEL_TOLERANCE = 0.02  # share of an image's pixels that may differ, as with another renderer
-_TOLERANCE = 1e-5  # of metrics, as on another machine; relative, and [m] or [s]
+# problems in the text
+_LISTED = 20
+# episodes on the statistics page
+_PICTURES = 10
+# episodes of which the first, middle and last images are rendered again
+_RENDERED = 3
+# of a pixel: of 255 levels, and [mm]
+_COLOUR_TOLERANCE = 16
+_DEPTH_TOLERANCE = 10
+# fraction of an image's pixels that may differ, as with another renderer
+_PIXEL_TOLERANCE = 0.02
+# of metrics, as on another machine; relative, and [m] or [s]
+_TOLERANCE = 1e-5
+# reasons that an episode is invalid, in its record
+_MAX_REASONS = 3
 
 
 @dataclass(frozen=True)
@@ -72,21 +80,22 @@ class DatasetCheck:
     def lines(self) -> list[str]:
         """Return the result as lines of text."""
         valid = self.episodes - len(self.refused)
-        found = [f"{self.folder}: {valid} of {self.episodes} episodes are valid"]
+        lines = [f"{self.folder}: {valid} of {self.episodes} episodes are valid"]
         problems = [f"episode {number}: {text}" for number, text in self.refused.items()]
         problems += self.problems
-        found += [f"  - {line}" for line in problems[:_LISTED]]
-        found += [f"  ... and {len(problems) - _LISTED} more"] if len(problems) > _LISTED else []
-        winding = Counter(tuple(sorted(record["winding"])) != () for record in self.records)
+        lines += [f"  - {line}" for line in problems[:_LISTED]]
+        if len(problems) > _LISTED:
+            lines.append(f"  ... and {len(problems) - _LISTED} more")
         if self.records:
-            found.append(
-                f"  base paths that wind around an obstacle: {winding[True]} of {len(self.records)}"
+            count = sum(1 for record in self.records if record["winding"])
+            lines.append(
+                f"  base paths that wind around an obstacle: {count} of {len(self.records)}"
             )
         if self.pixels:
-            found.append(f"  {self.pixels}")
+            lines.append(f"  {self.pixels}")
         if self.page is not None:
-            found.append(f"  statistics: {self.page}")
-        return found
+            lines.append(f"  statistics: {self.page}")
+        return lines
 
     def __str__(self) -> str:
         return "\n".join(self.lines())
@@ -119,31 +128,22 @@ def check_dataset(
     Raises:
         InputError: There is no dataset, or the page cannot be written.
     """
-    from tqdm import tqdm
-
-    jobs, seed = check_integer(jobs, "jobs", low=1, high=4096), check_integer(seed, "seed", low=0)
+    jobs = check_integer(jobs, "jobs", low=1, high=4096)
+    seed = check_integer(seed, "seed", low=0)
     dataset = Dataset.open(folder)
     target = dataset.folder / "statistics.html" if page is None else Path(page)
     if page is None:
         check_inside(target, dataset.folder)
     _check_page(target, dataset)
-    shards = dataset.shards
-    recipe = dataset.recipe.document
-    tasks = (
-        (str(k), (str(shard), str(dataset.folder / "scenes"), recipe))
-        for k, shard in enumerate(shards)
-    )
-    found: dict[int, tuple[list[dict[str, Any]], list[str]]] = {}
-    with tqdm(total=len(shards), unit="shard", disable=not progress) as bar:
-        for key, result in run_tasks(check_shard, tasks, jobs=jobs):
-            found[int(key)] = (
-                ([], [f"{shards[int(key)]}: {result.reason}"])
-                if isinstance(result, CrashedTask)
-                else result
-            )
-            bar.update()
-    records = [record for k in sorted(found) for record in found[k][0]]
-    problems = [text for k in sorted(found) for text in found[k][1]]
+    records: list[dict[str, Any]] = []
+    problems: list[str] = []
+    intact_shards: list[Path] = []
+    checks = _check_shards(dataset, jobs, progress=progress)
+    for shard, (shard_records, shard_problems) in zip(dataset.shards, checks, strict=True):
+        records += shard_records
+        problems += shard_problems
+        if not shard_problems:
+            intact_shards.append(shard)
     problems += _check_lerobot_folders(dataset, jobs)
     failures: list[dict[str, str]] = []
     with _collect_errors(problems, "episodes.csv"):
@@ -152,15 +152,14 @@ def check_dataset(
         failures = read_table(dataset.folder / "failures.csv")
     refused = {record["number"]: record["refused"] for record in records if record["refused"]}
     valid = [record["number"] for record in records if not record["refused"]]
-    chosen = np.random.default_rng(seed).permutation(len(valid))[:_PICTURES]
-    intact_shards = [shard for k, shard in enumerate(shards) if not found[k][1]]
-    shown_episodes = _read_selected(dataset, intact_shards, {valid[k] for k in chosen})
-    pixels, differences = _compare_pixels(
-        dataset.recipe, shown_episodes, [valid[k] for k in chosen[:_RENDERED]]
-    )
+    order = np.random.default_rng(seed).permutation(len(valid))
+    chosen = [valid[k] for k in order[:_PICTURES]]
+    shown_episodes = _read_selected(dataset, intact_shards, set(chosen))
+    pixels, differences = _compare_pixels(dataset.recipe, shown_episodes, chosen[:_RENDERED])
     # An unreadable episode fails the checks of both layouts for the same reason.
     reported = set(refused.values())
-    problems = [text for text in dict.fromkeys([*problems, *differences]) if text not in reported]
+    different = dict.fromkeys([*problems, *differences])
+    problems = [text for text in different if text not in reported]
     text = make_statistics_page(
         dataset.recipe, records, failures, shown_episodes, refused, problems
     )
@@ -170,9 +169,34 @@ def check_dataset(
     )
 
 
+_ShardCheck = tuple[list[dict[str, Any]], list[str]]
+"""Records of a shard's episodes, and problems of its file."""
+
+
+def _check_shards(dataset: Dataset, jobs: int, *, progress: bool) -> list[_ShardCheck]:
+    """Check all shards of a dataset."""
+    from tqdm import tqdm
+
+    shards = dataset.shards
+    scenes = str(dataset.folder / "scenes")
+    recipe = dataset.recipe.document
+    tasks = ((str(k), (str(shard), scenes, recipe)) for k, shard in enumerate(shards))
+    checks: dict[int, _ShardCheck] = {}
+    with tqdm(total=len(shards), unit="shard", disable=not progress) as bar:
+        for key, result in run_tasks(check_shard, tasks, jobs=jobs):
+            k = int(key)
+            if isinstance(result, CrashedTask):
+                checks[k] = ([], [f"{shards[k]}: {result.reason}"])
+            else:
+                checks[k] = result
+            bar.update()
+    return [checks[k] for k in range(len(shards))]
+
+
 def _check_page(page: Path, dataset: Dataset) -> None:
     """Check that a page can be written, and is no other file of the dataset."""
-    place, folder = check_writable(page, field="page"), dataset.folder.resolve()
+    place = check_writable(page, field="page")
+    folder = dataset.folder.resolve()
     if place.is_relative_to(folder) and place.relative_to(folder).parts[0] in MEMBERS:
         expected = "statistics.html, or a file elsewhere"
         raise InputError("a file of the dataset", file=page, field="page", expected=expected)
@@ -186,15 +210,19 @@ def check_shard(
     Args:
         task: The shard, the folder of its scenes, and its recipe's document.
     """
-    path, scenes, recipe = Path(task[0]), Path(task[1]), load_recipe(task[2], find_files=False)
-    records, problems = list[dict[str, Any]](), list[str]()
-    name = f"{path.parent.name}/{path.name}"  # for messages
+    path = Path(task[0])
+    scenes = Path(task[1])
+    recipe = load_recipe(task[2], find_files=False)
+    robot = path.parent.name
+    name = f"{robot}/{path.name}"  # for messages
+    records: list[dict[str, Any]] = []
+    problems: list[str] = []
     with _collect_errors(problems, name), open_shard(path, scenes) as shard:
         for k in range(len(shard)):
             with _collect_errors(problems, name):
-                records.append(_check_episode(shard, k, recipe, path.parent.name))
-        found = shard.find_shard_differences(path.parent.name, recipe)
-        problems += [f"{name}: {difference}" for difference in found]
+                records.append(_check_episode(shard, k, recipe, robot))
+        differences = shard.find_shard_differences(robot, recipe)
+        problems += [f"{name}: {difference}" for difference in differences]
     return records, problems
 
 
@@ -212,43 +240,49 @@ def _collect_errors(problems: list[str], name: str) -> Iterator[None]:
 def _check_episode(shard: Shard, k: int, recipe: Recipe, robot: str) -> dict[str, Any]:
     """Return the record of an episode; "refused" is the reason if it is invalid, else ""."""
     episode = shard.read(k)
-    motion, reasons = episode.trajectory, list[str]()
+    motion = episode.trajectory
+    reasons: list[str] = []
+    # What an episode has whose scene cannot be read:
+    start = motion.positions[0]
     winding: dict[str, int] = {}
-    start, fields = motion.positions[0], ("task", "room", "object", "kind", "attachment")
-    about: dict[str, Any] = {**dict.fromkeys(fields, ""), "goal": []}
+    about: dict[str, Any] = {
+        "task": "",
+        "room": "",
+        "object": "",
+        "kind": "",
+        "attachment": "",
+        "goal": [],
+    }
     with _collect_errors(reasons, "episode"):
         scene = episode.scene()
-        start, winding = scene.start, compute_winding_numbers(scene, motion)
+        start = scene.start
+        winding = compute_winding_numbers(scene, motion)
         about = describe_problem(scene, episode.steps)
         about["variant"] = episode.number % recipe.fields.variants
         report = validate(scene, episode.steps, motion, episode.options, episode.terms)
         reasons += [str(violation) for violation in report.violations]
         reasons += report.contradictions(episode.claimed)
-        reasons += _find_false_claims(
-            episode.about,
-            {**about, "robot": robot},
-            {**motion.metrics(), **report.measures()},
-        )
+        truth = {**about, "robot": robot}
+        metrics = {**motion.metrics(), **report.measures()}
+        reasons += _find_false_claims(episode.about, truth, metrics)
         if episode.document["robot"]["name"] != robot:
             got = format_value(episode.document["robot"]["name"])
             reasons.append(f"its scene is for the robot {got}, not {robot}")
         if episode.terms != resolve_episode_terms(recipe, scene, about):
             reasons.append("its terms differ from those of the recipe")
         reasons += shard.find_differences(k, episode, scene.robot, recipe.fields.rate)
-    clearance = episode.claimed.clearance
-    return {
-        **about,
-        **motion.metrics(),
-        **({"clearance": clearance} if np.isfinite(clearance) else {}),
-        "robot": robot,
-        "number": episode.number,
-        "scene": compute_scene_name(episode.document),
-        "start": np.asarray(start).round(4).tolist(),
-        "waypoints": len(motion.times),
-        "way": sample_coarse_trajectory(motion),
-        "winding": sorted(winding.items()),
-        "refused": "; ".join(reasons[:3]),
-    }
+    record = {**about, **motion.metrics()}
+    if np.isfinite(episode.claimed.clearance):
+        record["clearance"] = episode.claimed.clearance
+    record["robot"] = robot
+    record["number"] = episode.number
+    record["scene"] = compute_scene_name(episode.document)
+    record["start"] = np.asarray(start).round(4).tolist()
+    record["waypoints"] = len(motion.times)
+    record["way"] = sample_coarse_trajectory(motion)
+    record["winding"] = sorted(winding.items())
+    record["refused"] = "; ".join(reasons[:_MAX_REASONS])
+    return record
 
 
 def _compare_pixels(
@@ -259,9 +293,11 @@ def _compare_pixels(
     Returns:
         What was compared, and the differences.
     """
-    compared, problems, wanted = list[str](), list[str](), set(numbers)
     if not recipe.cameras:
         return "", []
+    wanted = set(numbers)
+    compared: list[str] = []
+    problems: list[str] = []
     for episode in sorted(episodes, key=lambda episode: episode.number):
         stored = episode.images() if episode.number in wanted else None
         if stored is None:
@@ -273,9 +309,10 @@ def _compare_pixels(
             images = render_images(executed, recipe.cameras, times[samples])
         except VkcError as error:  # no OpenGL on this machine
             return f"pixels not compared: {error}", problems
-        found = _find_different_images(images, stored, samples)
-        problems += [f"episode {episode.number}: {text}" for text in found]
-        compared.append(f"{episode.number} (samples {', '.join(map(str, samples.tolist()))})")
+        differences = _find_different_images(images, stored, samples)
+        problems += [f"episode {episode.number}: {text}" for text in differences]
+        listed = ", ".join(str(sample) for sample in samples.tolist())
+        compared.append(f"{episode.number} (samples {listed})")
     if not compared:
         return "pixels not compared: no valid episode has images", problems
     return f"pixels rendered again and compared: episode {', '.join(compared)}", problems
@@ -288,17 +325,15 @@ def _find_different_images(found: Images, stored: Images, samples: Ints) -> Iter
             yield f"{name}: missing"
             continue
         for k, sample in enumerate(samples.tolist()):
-            new, old = (
-                _name_segments(images, pixels) if name.endswith("_segmentation") else pixels
-                for images, pixels in (
-                    (found, pictures[k]),
-                    (stored, stored.pictures[name][sample]),
-                )
-            )
-            share = float(_find_different_pixels(new, old).mean())
-            if share > _PIXEL_TOLERANCE:
+            new: Any = pictures[k]
+            old: Any = stored.pictures[name][sample]
+            if name.endswith("_segmentation"):
+                new = _name_segments(found, new)
+                old = _name_segments(stored, old)
+            fraction = float(_find_different_pixels(new, old).mean())
+            if fraction > _PIXEL_TOLERANCE:
                 yield (
-                    f"{share:.0%} of the pixels of {name}[{sample}] differ from the images "
+                    f"{fraction:.0%} of the pixels of {name}[{sample}] differ from the images "
                     f"rendered again, {_PIXEL_TOLERANCE:.0%} may"
                 )
 
@@ -329,17 +364,19 @@ def _find_false_claims(
         truth: True values.
         metrics: True metrics, of which the claims have some.
     """
-    claims, claimed = dict(claims), claims.get("metrics")
-    claims.pop("metrics", None)
-    numbers = claimed if isinstance(claimed, dict) else {}
-    found = [
-        f"about.{name} is {format_value(claims.get(name))}, not {format_value(truth.get(name))}"
-        for name in {**truth, **claims}
-        if name not in claims or name not in truth or claims[name] != truth[name]
-    ]
-    if claimed is not numbers:
-        found.append(f"about.metrics are {format_value(claimed)}")
-    for name, value in numbers.items():
+    claims = dict(claims)
+    claimed_metrics = claims.pop("metrics", None)
+    found: list[str] = []
+    for name in {**truth, **claims}:
+        if name in claims and name in truth and claims[name] == truth[name]:
+            continue
+        got = format_value(claims.get(name))
+        found.append(f"about.{name} is {got}, not {format_value(truth.get(name))}")
+    if not isinstance(claimed_metrics, dict):
+        found.append(f"about.metrics are {format_value(claimed_metrics)}")
+        return found
+    for name, value in claimed_metrics.items():
+        # The number of evaluations does not follow from the motion.
         known = metrics.get(name, value if name == "evaluations" else np.nan)
         if not is_number(value) or not abs(value - known) <= _TOLERANCE * max(1.0, abs(known)):
             got = format_value(value)
@@ -353,13 +390,13 @@ def check_lerobot(task: tuple[str, str]) -> list[str]:
     Args:
         task: The dataset, and the robot.
     """
-    dataset, robot = Dataset.open(task[0]), task[1]
+    folder, robot = task
+    dataset = Dataset.open(folder)
     problems: list[str] = []
     with _collect_errors(problems, f"lerobot/{robot}"):
-        found = find_differences(
-            dataset.folder / "lerobot" / robot, dataset.episodes(robot), dataset.recipe.fields.rate
-        )
-        problems += [f"lerobot/{robot}/{difference}" for difference in found]
+        path = dataset.folder / "lerobot" / robot
+        differences = find_differences(path, dataset.episodes(robot), dataset.recipe.fields.rate)
+        problems += [f"lerobot/{robot}/{difference}" for difference in differences]
     return problems
 
 
@@ -377,15 +414,18 @@ def _check_lerobot_folders(dataset: Dataset, jobs: int) -> Iterator[str]:
     found = dict(run_tasks(check_lerobot, tasks, jobs=jobs))
     for name in sorted(found):
         result = found[name]
-        yield from [result.reason] if isinstance(result, CrashedTask) else result
+        if isinstance(result, CrashedTask):
+            yield result.reason
+        else:
+            yield from result
 
 
 def _check_consistency(dataset: Dataset, records: list[dict[str, Any]]) -> Iterator[str]:
     """Yield problems of the episodes as a whole."""
     counts = Counter(record["number"] for record in records)
-    yield from (
-        f"episode {number} occurs {count} times" for number, count in counts.items() if count > 1
-    )
+    for number, count in counts.items():
+        if count > 1:
+            yield f"episode {number} occurs {count} times"
     finder = DuplicateFinder()
     for record in sorted(records, key=lambda record: int(record["number"])):
         duplicate = finder.find_duplicate(record)
@@ -416,8 +456,11 @@ def _is_cell_of(text: str, value: Any) -> bool:
 
 def _read_selected(dataset: Dataset, shards: Iterable[Path], numbers: set[int]) -> list[Episode]:
     """Return the episodes with some numbers, from the shards that contain them."""
-    shards = (shard for shard in shards if numbers & set(read_numbers(shard)))
-    every = itertools.chain.from_iterable(
-        read_episodes(shard, dataset.folder / "scenes") for shard in shards
-    )
-    return [episode for episode in every if episode.number in numbers]
+    selected: list[Episode] = []
+    for shard in shards:
+        if numbers.isdisjoint(read_numbers(shard)):
+            continue
+        for episode in read_episodes(shard, dataset.folder / "scenes"):
+            if episode.number in numbers:
+                selected.append(episode)
+    return selected

@@ -15,8 +15,10 @@ NEAR = 0.02
 """Largest difference of near-duplicates in any coordinate [m] or [rad].
 
 Trajectories are compared at equal fractions of their durations."""
-_SAMPLES = 9  # times at which trajectories are compared
-_GROUND = 1.6  # [m] height above which obstacles do not block the base
+# times at which trajectories are compared
+_SAMPLES = 9
+# [m] height above which obstacles do not block the base
+_GROUND = 1.6
 
 
 def sample_coarse_trajectory(trajectory: Trajectory) -> list[list[float]]:
@@ -38,9 +40,10 @@ class DuplicateFinder:
         group = (record["scene"], record["task"], record["object"], trajectory.shape)
         known = self._trajectories.setdefault(group, [])
         if known:
-            gaps = np.abs(np.array([other for _, other in known]) - trajectory).max(axis=(1, 2))
-            nearest = int(np.argmin(gaps))
-            if gaps[nearest] < NEAR and goal is not None:
+            others = np.array([other for _, other in known])
+            differences = np.abs(others - trajectory).max(axis=(1, 2))
+            nearest = int(np.argmin(differences))
+            if differences[nearest] < NEAR and goal is not None:
                 return known[nearest][0]
         known.append((int(record["number"]), trajectory))
         return None
@@ -58,14 +61,14 @@ def compute_winding_numbers(scene: Scene, trajectory: Trajectory) -> dict[str, i
         the obstacle on its left.
     """
     path = _sample_base_path(trajectory)
-    found = {}
+    numbers: dict[str, int] = {}
     for name, point in _find_obstacle_positions(scene).items():
         rotation = _compute_rotation(path - point)
         straight = _compute_rotation(path[[0, -1]] - point)
         turns = round((rotation - straight) / (2.0 * np.pi))
         if turns:
-            found[name] = int(turns)
-    return found
+            numbers[name] = int(turns)
+    return numbers
 
 
 def _sample_base_path(trajectory: Trajectory) -> Floats:
@@ -82,22 +85,22 @@ def _compute_rotation(points: Floats) -> float:
 
 def _find_obstacle_positions(scene: Scene) -> dict[str, Floats]:
     """Return the positions of obstacles on the floor and of fixed objects, by name."""
-    found: dict[str, Floats] = {}
+    positions: dict[str, Floats] = {}
     for shape, label in zip(scene.obstacles, scene.obstacle_labels, strict=True):
-        where = shape.placement.translation
-        if label != "floor" and where[2] < _GROUND and not label.startswith("wall_"):
-            found.setdefault(label, np.array(where[:2]))
+        position = shape.placement.translation
+        is_on_floor = label != "floor" and position[2] < _GROUND
+        if is_on_floor and not label.startswith("wall_"):
+            positions.setdefault(label, np.array(position[:2]))
     for name, placed in scene.objects.items():
         if not placed.object.free:
-            found[name] = np.array(placed.placement.translation[:2])
-    return found
+            positions[name] = np.array(placed.placement.translation[:2])
+    return positions
 
 
 def compute_coverage(values: Sequence[float], low: float, high: float, cells: int = 10) -> float:
     """Return the fraction of equal cells of an interval that contain a value."""
     if high <= low or not len(values):
         return 0.0
-    cell = np.clip(
-        ((np.asarray(values, float) - low) / (high - low) * cells).astype(int), 0, cells - 1
-    )
-    return len(set(cell.tolist())) / cells
+    fractions = (np.asarray(values, float) - low) / (high - low)
+    numbers = np.clip((fractions * cells).astype(int), 0, cells - 1)
+    return len(set(numbers.tolist())) / cells

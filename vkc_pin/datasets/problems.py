@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -29,14 +29,21 @@ from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Actuate, Grasp, Place, Step
 from vkc_pin.world.task.terms import Term, trace_terms
 
-_BATCH = 48  # random configurations that inverse kinematics brings to the grasp at once
-_DRAWS = 6  # batches before there is none
-_EXACT = 1e-2 * TOLERANCE  # [m], [rad]: accepted distance of the hand from its grasp
-_CACHED_ROOMS = 48  # rooms in a process's cache
-_STARTS = 300  # sampled start poses
+# random configurations that inverse kinematics brings to the grasp at once
+_BATCH = 48
+# batches before there is none
+_DRAWS = 6
+# [m], [rad] accepted distance of the hand from its grasp
+_EXACT = 1e-2 * TOLERANCE
+# rooms in a process's cache
+_CACHED_ROOMS = 48
+# sampled start poses
+_STARTS = 300
 _TABLES = 2
-_GAP = 0.001  # [m] gap between a placed object and its table
-_MARGIN = 0.12  # [m] from the ends of a table to the centre of a placed object
+# [m] gap between a placed object and its table
+_GAP = 0.001
+# [m] from the ends of a table to the centre of a placed object
+_MARGIN = 0.12
 _load_scene = functools.lru_cache(maxsize=_CACHED_ROOMS)(load_scene)
 
 
@@ -74,37 +81,60 @@ def find_grasping_start(
             trace_terms(scene, terms),
             cache=cache,
         )
-        chain, robot = problem.chain, scene.robot.coordinates.size
-        search = KeyframeSampler(problem, rng)
-        pose = search.find_pose(1)
-        freedoms = [
-            chain.index(f"{name}.{own}")
-            for own in scene.objects[name].object.attachments[attachment].coordinates
-        ]
-        if pose is None:
+        chain = problem.chain
+        coordinates = scene.objects[name].object.attachments[attachment].coordinates
+        freedoms = [chain.index(f"{name}.{coordinate}") for coordinate in coordinates]
+        row = _sample_grasping_configuration(problem, freedoms, rng)
+        if row is None:
             return None
-        solver, target = search.get_pose_solver(pose)
-        for _ in range(_DRAWS):
-            z = np.tile(problem.start, (_BATCH, 1))
-            z[:, freedoms] = rng.uniform(
-                chain.lower[freedoms], chain.upper[freedoms], (_BATCH, len(freedoms))
-            )
-            z, _ = search.sample(z, 1, "scatter")
-            # The object is as at the start, not a step later.
-            z[:, search.object_columns] = problem.start[search.object_columns]
-            limits = np.array([problem.limits(name) for name in chain.names]).T
-            lower, upper = (np.tile(limit, (_BATCH, 1)) for limit in limits)
-            fixed = [*freedoms, *search.object_columns.tolist()]
-            lower[:, fixed] = upper[:, fixed] = z[:, fixed]
-            z, found = solver.solve(
-                z, target, lower=lower, upper=upper, weights=search.weights, tolerance=_EXACT
-            )
-            z = z[found]
-            z = z[compute_shortfall(problem, z, 0) <= 0.0] if len(z) else z
-            if len(z):
-                row = z[int(rng.integers(len(z)))]
-                there = scene.with_start(base=row[:3], arm=row[3:robot])
-                return there.with_held([Hold(name, attachment, at=tuple(row[freedoms].tolist()))])
+        start = scene.with_start(base=row[:3], arm=row[3 : scene.robot.coordinates.size])
+        return start.with_held([Hold(name, attachment, at=tuple(row[freedoms].tolist()))])
+
+
+def _sample_grasping_configuration(
+    problem: TrajectoryProblem, freedoms: Sequence[int], rng: np.random.Generator
+) -> Floats | None:
+    """Sample a free configuration of a chain at the pose of its first phase, shape (n,).
+
+    Random configurations are brought to the pose by inverse kinematics, with random values of the
+    grasp's freedoms.
+
+    Args:
+        problem: Program of the task.
+        freedoms: Coordinates of the grasp's freedoms.
+        rng: Random generator.
+
+    Returns:
+        The configuration, or None if none was found.
+    """
+    chain = problem.chain
+    search = KeyframeSampler(problem, rng)
+    pose = search.find_pose(1)
+    if pose is None:
+        return None
+    solver, target = search.get_pose_solver(pose)
+    limits = np.array([problem.limits(name) for name in chain.names])
+    fixed = [*freedoms, *search.object_columns.tolist()]
+    for _ in range(_DRAWS):
+        z = np.tile(problem.start, (_BATCH, 1))
+        z[:, freedoms] = rng.uniform(
+            chain.lower[freedoms], chain.upper[freedoms], (_BATCH, len(freedoms))
+        )
+        z, _ = search.sample(z, 1, "scatter")
+        # The object is as at the start, not a step later.
+        z[:, search.object_columns] = problem.start[search.object_columns]
+        lower = np.tile(limits[:, 0], (_BATCH, 1))
+        upper = np.tile(limits[:, 1], (_BATCH, 1))
+        lower[:, fixed] = z[:, fixed]
+        upper[:, fixed] = z[:, fixed]
+        z, is_solved = solver.solve(
+            z, target, lower=lower, upper=upper, weights=search.weights, tolerance=_EXACT
+        )
+        z = z[is_solved]
+        if len(z):
+            z = z[compute_shortfall(problem, z, 0) <= 0.0]
+        if len(z):
+            return np.asarray(z[int(rng.integers(len(z)))])
     return None
 
 
@@ -161,9 +191,9 @@ def sample_problem(
     """
     fields = recipe.fields
     group, variant = divmod(number, fields.variants)
-    rng, block = recipe.rng("episode", group), group // fields.rooms.episodes
+    block = group // fields.rooms.episodes
+    rng = recipe.rng("episode", group)
     task = str(rng.choice(fields.tasks))
-    recipe_json = json.dumps(recipe.document, sort_keys=True)
     if fields.scenes:
         place = _Place(_load_scene(fields.scenes[block % len(fields.scenes)]), None)
         robot = place.scene.robot.name
@@ -173,26 +203,21 @@ def sample_problem(
         turn = block + block // rooms
         entry = fields.robots[turn % len(fields.robots)]
         place = _make_place(
-            recipe_json,
+            json.dumps(recipe.document, sort_keys=True),
             fields.rooms.first + block % rooms,
             robots.get(entry.name, entry.name),
             entry.height,
         )
         robot = entry.name
+    if task == "fetch-place":
+        scene, steps = _sample_fetch_task(recipe, place, rng)
+    else:
+        scene, steps = _sample_open_task(recipe, place, rng, task == "given-open", planner)
     about: dict[str, Any] = {"task": task, "robot": get_robot_name(robot)}
-    scene, steps = (_sample_fetch_task if task == "fetch-place" else _sample_open_task)(
-        recipe, place, rng, task == "given-open", planner
-    )
-    about |= {**describe_problem(scene, steps), "variant": variant}
-    return Problem(
-        number,
-        scene,
-        steps,
-        recipe.options,
-        variant,
-        about,
-        resolve_episode_terms(recipe, scene, about),
-    )
+    about.update(describe_problem(scene, steps))
+    about["variant"] = variant
+    terms = resolve_episode_terms(recipe, scene, about)
+    return Problem(number, scene, steps, recipe.options, variant, about, terms)
 
 
 def describe_problem(scene: Scene, steps: Sequence[Step]) -> dict[str, Any]:
@@ -239,16 +264,21 @@ def resolve_episode_terms(
 def _sample_layout(recipe_json: str, room: int) -> Layout:
     """Return the layout of a random room, independent of the robot; cached."""
     recipe = load_recipe(json.loads(recipe_json))
-    rng, fields = recipe.rng("room", room), recipe.fields
-    kinds = rng.choice(
-        fields.objects, min(fields.rooms.objects, len(fields.objects)), replace=False
-    )
-    fetched = "fetch-place" in fields.tasks
+    fields = recipe.fields
+    rng = recipe.rng("room", room)
+    count = min(fields.rooms.objects, len(fields.objects))
+    kinds = rng.choice(fields.objects, count, replace=False)
+    clutter = round(float(rng.uniform(*fields.rooms.clutter)), 3)
+    tables = 0
+    carried: tuple[str, ...] = ()
+    if "fetch-place" in fields.tasks:
+        tables = _TABLES
+        carried = (str(rng.choice(fields.carried)),)
     settings = RoomSettings(
-        clutter=round(float(rng.uniform(*fields.rooms.clutter)), 3),
-        objects=tuple(map(str, kinds)),
-        tables=_TABLES if fetched else 0,
-        carried=(str(rng.choice(fields.carried)),) if fetched else (),
+        clutter=clutter,
+        objects=tuple(str(kind) for kind in kinds),
+        tables=tables,
+        carried=carried,
         width=fields.rooms.width,
         front=fields.rooms.front,
     )
@@ -264,10 +294,9 @@ def _make_place(recipe_json: str, room: int, robot: str, height: float | None) -
         document = scene.document
         if robot != scene.robot.name or height is not None:
             document["robot"] = {"name": robot}
-            document["start"] = {
-                "base": document["start"]["base"],
-                **({} if height is None else {"z": height}),
-            }
+            document["start"] = {"base": document["start"]["base"]}
+            if height is not None:
+                document["start"]["z"] = height
             scene = Scene.from_document(document, scene.folder)
         return _Place(scene, layout)
     except VkcError as error:
@@ -278,7 +307,8 @@ def _sample_open_task(
     recipe: Recipe, place: _Place, rng: np.random.Generator, given: bool, planner: Planner
 ) -> tuple[Scene, tuple[Step, ...]]:
     """Return scene and steps of a task that opens or closes something."""
-    scene, fields = place.scene, recipe.fields
+    scene = place.scene
+    fields = recipe.fields
     share = round(float(rng.uniform(*fields.goal.share)), 4)
     offered = [step for step in goals(scene, share=share) if isinstance(step, Actuate)]
     if not offered:
@@ -298,34 +328,35 @@ def _sample_open_task(
         ]
         attachment = str(rng.choice(sorted(names_on_link)))
     step = Actuate(name, step.joints, attachment)
-    if given:
-        terms = resolve_terms(recipe.select_terms("given-open"), scene, name, attachment)
-        found = find_grasping_start(scene, step, rng, recipe.options, planner, terms)
-        if found is None:
-            raise NoProblemError(f"no free grasp of {name}.{attachment} in {scene.name} was found")
-        scene = found
-    else:
-        scene = _sample_start(recipe, place, rng, scene.objects[name].placement.translation)
-    return scene, (step,)
+    if not given:
+        start = _sample_start(recipe, place, rng, scene.objects[name].placement.translation)
+        return start, (step,)
+    terms = resolve_terms(recipe.select_terms("given-open"), scene, name, attachment)
+    grasping = find_grasping_start(scene, step, rng, recipe.options, planner, terms)
+    if grasping is None:
+        raise NoProblemError(f"no free grasp of {name}.{attachment} in {scene.name} was found")
+    return grasping, (step,)
 
 
 def _sample_fetch_task(
-    recipe: Recipe, place: _Place, rng: np.random.Generator, given: bool, planner: Planner
+    recipe: Recipe, place: _Place, rng: np.random.Generator
 ) -> tuple[Scene, tuple[Step, ...]]:
     """Return scene and steps of a task that moves an object to another table."""
-    scene, layout, fields = place.scene, place.layout, recipe.fields
+    scene = place.scene
+    layout = place.layout
+    fields = recipe.fields
     assert layout is not None  # recipes of scene files do not fetch
     free = [name for name, placed in scene.objects.items() if placed.object.free]
     name = str(rng.choice(sorted(free)))
     placed = scene.objects[name]
-    attachments = placed.object.attachments.values()
-    names = sorted(one.name for one in attachments if one.contact == "grasp")
-    attachment = (
-        str(rng.choice(names)) if fields.grasps == "any" else next(iter(placed.object.attachments))
-    )
-    others = [
-        part for part in layout.parts if part.name.startswith("table_") and part.name != "table_1"
-    ]
+    attachments = placed.object.attachments
+    if fields.grasps == "any":
+        names = sorted(one.name for one in attachments.values() if one.contact == "grasp")
+        attachment = str(rng.choice(names))
+    else:
+        attachment = next(iter(attachments))
+    tables = [part for part in layout.parts if part.name.startswith("table_")]
+    others = [part for part in tables if part.name != "table_1"]
     table = others[int(rng.integers(len(others)))]
     target = _sample_position_on_table(table, placed.object.name, rng, fields.goal.edge)
     scene = _sample_start(recipe, place, rng, placed.placement.translation)
@@ -337,26 +368,26 @@ def _sample_position_on_table(
 ) -> tuple[float, float, float]:
     """Return a position on a table near the side where robots can stand, in the world [m]."""
     depth, width, height = table.size
+    # In the table's frame: x from the side where robots stand, y along it.
     x = -depth / 2.0 + min(float(rng.uniform(*edge)), depth - _MARGIN)
     y = float(rng.uniform(-1.0, 1.0)) * (width / 2.0 - _MARGIN)
-    return *table.frame.transform_point(x, y), round(height + CARRIED[kind] + _GAP, 4)
+    world_x, world_y = table.frame.transform_point(x, y)
+    return world_x, world_y, round(height + CARRIED[kind] + _GAP, 4)
 
 
 def _sample_start(recipe: Recipe, place: _Place, rng: np.random.Generator, goal: Floats) -> Scene:
     """Return the scene with a random start pose connected to all goals, and the arm near home."""
-    scene, start = place.scene, recipe.fields.start
+    scene = place.scene
+    home = scene.robot.home
+    start = recipe.fields.start
+    nearest, farthest = start.distance
     low, high = scene.robot.start_limits
-    x, y = np.array(scene.arena).reshape(2, 2)
-    anywhere = (rng.uniform([x[0], y[0], -np.pi], [x[1], y[1], np.pi]) for _ in range(_STARTS))
-    for base in itertools.islice(
-        scene.start_region.sample_poses(rng) if scene.start_region else anywhere, _STARTS
-    ):
-        base = np.round(base, 4)
-        if not start.distance[0] <= np.linalg.norm(base[:2] - goal[:2]) <= start.distance[
-            1
-        ] or not _is_connected(place, base):
+    for pose in itertools.islice(_sample_poses(scene, rng), _STARTS):
+        base = np.round(pose, 4)
+        distance = np.linalg.norm(base[:2] - goal[:2])
+        if not nearest <= distance <= farthest or not _is_connected(place, base):
             continue
-        arm = scene.robot.home + rng.uniform(-1.0, 1.0, len(scene.robot.home)) * start.arm
+        arm = home + rng.uniform(-1.0, 1.0, len(home)) * start.arm
         candidate = scene.with_start(base=base, arm=np.clip(np.round(arm, 4), low[3:], high[3:]))
         if candidate.start_clearance(reach=START_CLEARANCE) >= START_CLEARANCE:
             return candidate
@@ -365,15 +396,24 @@ def _sample_start(recipe: Recipe, place: _Place, rng: np.random.Generator, goal:
     )
 
 
+def _sample_poses(scene: Scene, rng: np.random.Generator) -> Iterator[Floats]:
+    """Yield random poses of the base in the scene's region of starts, or anywhere in its arena."""
+    if scene.start_region:
+        yield from scene.start_region.sample_poses(rng)
+        return
+    x_min, x_max, y_min, y_max = scene.arena
+    while True:
+        yield rng.uniform([x_min, y_min, -np.pi], [x_max, y_max, np.pi])
+
+
 def _is_connected(place: _Place, base: Floats) -> bool:
     """Return whether the robot can drive from a pose to all places where it has to stand."""
-    if place.layout is None:
+    layout = place.layout
+    if layout is None:
         return True
-    standing = [part.footprint for part in place.layout.parts if part.size != (0.0, 0.0, 0.0)]
-    where = (float(base[0]), float(base[1]))
-    if not place.layout.floor.find_free(standing, place.layout.radius, [where])[0]:
+    footprints = [part.footprint for part in layout.parts if part.size != (0.0, 0.0, 0.0)]
+    position = (float(base[0]), float(base[1]))
+    if not layout.floor.find_free(footprints, layout.radius, [position])[0]:
         return False
-    standing_places = [
-        part.standing_place for part in place.layout.parts if part.standing_place is not None
-    ]
-    return place.layout.floor.is_connected(standing, place.layout.radius, [*standing_places, where])
+    places = [part.standing_place for part in layout.parts if part.standing_place is not None]
+    return layout.floor.is_connected(footprints, layout.radius, [*places, position])

@@ -49,28 +49,32 @@ from vkc_pin.world.task.terms import (
 
 OBJECT = "object"
 """Frame of the grasped link, and the grasped object in `holding`."""
-
-Axis = Annotated[
-    Vector3,
-    require(lambda value: math.hypot(*value) > 0.0, "no direction", "an axis of some length"),
-]
-Size = Annotated[tuple[Positive, Positive, Positive], require_length(3)]
 TASKS = ("given-open", "drive-open", "fetch-place")
 """Tasks of episodes: open an object from a given grasp, drive there and open it, or move an object
 to another table."""
-_increasing = require(
+
+# Conditions of fields.
+_has_length = require(
+    lambda value: math.hypot(*value) > 0.0, "no direction", "an axis of some length"
+)
+_is_increasing = require(
     lambda value: value[0] <= value[1], "the interval is empty", "[lowest, highest]"
 )
-_share = require(
+_is_share = require(
     lambda value: value[0] > 0.0 and value[1] <= 1.0, "out of range", "shares above 0 and up to 1"
 )
-Interval = Annotated[tuple[Number, Number], require_length(2), _increasing]
-Share = Annotated[Interval, _share]
-Distances = Annotated[tuple[NonNegative, NonNegative], require_length(2), _increasing]
+_is_given = require(lambda value: value, "there is nothing", "at least one")
+
+Axis = Annotated[Vector3, _has_length]
+Size = Annotated[tuple[Positive, Positive, Positive], require_length(3)]
+Interval = Annotated[tuple[Number, Number], require_length(2), _is_increasing]
+Share = Annotated[Interval, _is_share]
+Distances = Annotated[tuple[NonNegative, NonNegative], require_length(2), _is_increasing]
 Whole = Annotated[int, Field(strict=True, ge=1, le=10**9)]
-Several = Annotated[int, Field(strict=True, ge=1, le=1000)]  # attempts of a process at a time
+# attempts of a process at a time
+Several = Annotated[int, Field(strict=True, ge=1, le=1000)]
 Pixels = Annotated[int, Field(strict=True, ge=8, le=2048)]
-Names = Annotated[tuple[str, ...], require(lambda value: value, "there is nothing", "at least one")]
+Names = Annotated[tuple[str, ...], _is_given]
 CAMERAS = (
     {
         "name": "head",
@@ -89,7 +93,6 @@ CAMERAS = (
     },
 )
 """Default cameras: one above the base, one beside the fingers."""
-_some = require(lambda value: value, "there is nothing", "at least one")
 
 
 class _Entry(Schema):
@@ -103,7 +106,9 @@ class _Entry(Schema):
         raise NotImplementedError
 
 
-class _Framed(_Entry):
+class _FrameEntry(_Entry):
+    """A term of one frame."""
+
     type: str
     frame: str = HAND
     held: bool = False
@@ -119,7 +124,7 @@ class _Framed(_Entry):
         return OBJECT if self.held else None
 
 
-class UprightSchema(_Framed):
+class UprightSchema(_FrameEntry):
     """Limits the angle of a frame's axis from the vertical [rad]."""
 
     type: Literal["upright"]
@@ -127,16 +132,20 @@ class UprightSchema(_Framed):
     angle: Annotated[Positive, Field(lt=math.pi)] = 0.2
 
     def term(self) -> Term:
-        """Return the constraint on the vertical component of the axis."""
+        """Return the constraint on the vertical component of the axis.
+
+        With the frame's rotation R and the unit axis a it is (R a)_z, the cosine of the angle.
+        """
         unit = [value / math.hypot(*self.axis) for value in self.axis]
 
-        def rises(s: State) -> Any:
+        def compute_rise(s: State) -> Any:
             return sum(value * s.rotation(self.frame)[2, k] for k, value in enumerate(unit))
 
-        return Constraint(self.called, rises, lower=math.cos(self.angle), holding=self.holding)
+        lower = math.cos(self.angle)
+        return Constraint(self.called, compute_rise, lower=lower, holding=self.holding)
 
 
-class SpeedSchema(_Framed):
+class SpeedSchema(_FrameEntry):
     """Limits the speed of a frame's origin [m/s]."""
 
     type: Literal["speed"]
@@ -145,14 +154,14 @@ class SpeedSchema(_Framed):
     def term(self) -> Term:
         """Return the constraint on the speed."""
 
-        def speed(s: State) -> Any:
-            moved = s.velocity(self.frame)
-            return (moved.T @ moved) ** 0.5
+        def compute_speed(s: State) -> Any:
+            velocity = s.velocity(self.frame)
+            return (velocity.T @ velocity) ** 0.5
 
-        return Constraint(self.called, speed, upper=self.most, holding=self.holding)
+        return Constraint(self.called, compute_speed, upper=self.most, holding=self.holding)
 
 
-class KeepOutSchema(_Framed):
+class KeepOutSchema(_FrameEntry):
     """Keeps the origin of a frame out of a box in the world frame."""
 
     type: Literal["keep-out"]
@@ -162,12 +171,12 @@ class KeepOutSchema(_Framed):
     def term(self) -> Term:
         """Return the constraint on the largest distance outside along an axis of the box [m]."""
 
-        def outside(s: State) -> Any:
-            away = s.position(self.frame)
-            x, y, z = ((away[k] - self.position[k]).fabs() - self.size[k] / 2.0 for k in range(3))
+        def compute_distance(s: State) -> Any:
+            point = s.position(self.frame)
+            x, y, z = ((point[k] - self.position[k]).fabs() - self.size[k] / 2.0 for k in range(3))
             return x.fmax(y).fmax(z)
 
-        return Constraint(self.called, outside, lower=0.0, holding=self.holding)
+        return Constraint(self.called, compute_distance, lower=0.0, holding=self.holding)
 
 
 class TracedSchema(_Entry):
@@ -193,13 +202,14 @@ def make_entries(terms: Sequence[Term]) -> list[dict[str, Any]]:
     Raises:
         InputError: They are no terms, or name phases, which are not known yet.
     """
-    for term in (found := trace_terms_without_scene(terms)):
+    traced = trace_terms_without_scene(terms)
+    for term in traced:
         if term.during is not None:
             expected = (
                 f"holding={OBJECT!r}, or nothing: phases are called after objects that are drawn"
             )
             raise term.make_error("phases are not known yet", "during", expected, list(term.during))
-    return [{"type": "traced", "traced": term_to_dict(term)} for term in found]
+    return [{"type": "traced", "traced": term_to_dict(term)} for term in traced]
 
 
 def check_entries(document: Document, entries: Sequence[Entry], tasks: Sequence[str]) -> None:
@@ -233,10 +243,12 @@ def check_robot(robot: Robot, terms: Sequence[Term]) -> None:
     frames = sorted({BASE, HAND, OBJECT, *robot.frame_names})
     for term in terms:
         where = f"terms[{term.name!r}]"
-        for frame in (name for name in term.formula.frames if "." not in name):
-            check_choice(frame, frames, f"frame of {robot.name}", where)
-        for coordinate in (name for name in term.formula.coordinates if "." not in name):
-            check_choice(coordinate, robot.coordinates.names, f"coordinate of {robot.name}", where)
+        for frame in term.formula.frames:
+            if "." not in frame:
+                check_choice(frame, frames, f"frame of {robot.name}", where)
+        for name in term.formula.coordinates:
+            if "." not in name:
+                check_choice(name, robot.coordinates.names, f"coordinate of {robot.name}", where)
 
 
 def resolve_terms(
@@ -251,8 +263,10 @@ def resolve_terms(
         attachment: Attachment that is grasped.
     """
     link = scene.objects[name].object.attachments[attachment].link
-    frames = {word: resolve_frame(scene.robot, word) for word in (BASE, HAND)} | {
-        OBJECT: f"{name}.{link}"
+    frames = {
+        BASE: resolve_frame(scene.robot, BASE),
+        HAND: resolve_frame(scene.robot, HAND),
+        OBJECT: f"{name}.{link}",
     }
     return tuple(rename_term(term, frames, {OBJECT: name}) for term in terms)
 
@@ -306,7 +320,7 @@ class CameraSchema(Schema):
     fov: Annotated[Positive, Field(lt=180.0)] = 60.0
 
 
-Robots = Annotated[tuple[Annotated[RobotEntry, wrap_text("name")], ...], _some]
+Robots = Annotated[tuple[Annotated[RobotEntry, wrap_text("name")], ...], _is_given]
 
 
 class RecipeSchema(Schema):
@@ -315,10 +329,7 @@ class RecipeSchema(Schema):
     name: Name
     license: str = "CC-BY-4.0"
     robots: Robots = (RobotEntry(name="husky_ur5e"),)
-    tasks: Annotated[
-        tuple[Literal[TASKS], ...],  # type: ignore[valid-type]
-        require(lambda v: v, "there is nothing", "at least one"),
-    ] = TASKS
+    tasks: Annotated[tuple[Literal[TASKS], ...], _is_given] = TASKS  # type: ignore[valid-type]
     objects: Names = (
         "random_cabinet",
         "random_drawers",
@@ -363,13 +374,15 @@ class Recipe:
     @property
     def digest(self) -> str:
         """Digest of all that determines the episodes."""
-        said = {
-            key: value for key, value in self.document.items() if key not in ("name", "license")
-        }
+        content = self.document
+        del content["name"]
+        del content["license"]
+        # Datasets of older versions, which knew neither cameras nor terms, can be continued.
         for name in ("cameras", "terms"):
-            if not said[name]:
-                del said[name]  # datasets without them are gone on with whatever the version
-        return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:16]
+            if not content[name]:
+                del content[name]
+        text = json.dumps(content, sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
@@ -388,10 +401,9 @@ class Recipe:
 
     def rng(self, *words: object) -> np.random.Generator:
         """Return a random generator determined by the recipe and some words, such as a number."""
-        text = "/".join([self.digest, *map(str, words)])
-        return np.random.default_rng(
-            int.from_bytes(hashlib.sha256(text.encode()).digest()[:16], "little")
-        )
+        text = "/".join([self.digest, *(str(word) for word in words)])
+        digest = hashlib.sha256(text.encode()).digest()
+        return np.random.default_rng(int.from_bytes(digest[:16], "little"))
 
 
 def load_recipe(
@@ -419,20 +431,23 @@ def load_recipe(
     if isinstance(document.data, dict):
         document = Document({**document.data, **changes}, document.file, document.lines)
     fields = parse_document(document, RecipeSchema)
+    found = _find_files(document, fields) if find_files else {}
+    _check_fields(document, fields)
+    options = _make_options(document, fields.options)
+    return Recipe(fields.model_copy(update=found), options)
+
+
+def _find_files(document: Document, fields: RecipeSchema) -> dict[str, Any]:
+    """Return the fields with names of robots, objects and scenes, those of files as full paths."""
     folder = document.file.parent if document.file else Path()
-    found = (
-        {
-            "robots": _robots(document, fields.robots, folder),
-            "objects": tuple(
-                _object(document, k, name, folder) for k, name in enumerate(fields.objects)
-            ),
-            "scenes": tuple(
-                _scene(document, k, name, folder) for k, name in enumerate(fields.scenes)
-            ),
-        }
-        if find_files
-        else {}
-    )
+    robots = _find_robots(document, fields.robots, folder)
+    objects = [_find_object(document, k, name, folder) for k, name in enumerate(fields.objects)]
+    scenes = [_find_scene(document, k, name, folder) for k, name in enumerate(fields.scenes)]
+    return {"robots": robots, "objects": tuple(objects), "scenes": tuple(scenes)}
+
+
+def _check_fields(document: Document, fields: RecipeSchema) -> None:
+    """Check what a schema cannot express."""
     for k, kind in enumerate(fields.carried):
         if kind not in CARRIED:
             raise document.make_unknown_name_error(
@@ -463,14 +478,13 @@ def load_recipe(
             ("cameras",), "nothing is simulated", expected=expected, got="cameras"
         )
     with document.annotate_errors(("rooms",)):
-        RoomSettings(
-            clutter=fields.rooms.clutter[0], width=fields.rooms.width, front=fields.rooms.front
-        )
-        RoomSettings(clutter=fields.rooms.clutter[1])
-    return Recipe(fields.model_copy(update=found), _options(document, fields.options))
+        least, most = fields.rooms.clutter
+        RoomSettings(clutter=least, width=fields.rooms.width, front=fields.rooms.front)
+        RoomSettings(clutter=most)
 
 
-def _options(document: Document, given: Mapping[str, Any]) -> Options:
+def _make_options(document: Document, given: Mapping[str, Any]) -> Options:
+    """Make the options of planning; errors name the file."""
     for name in given:
         if name not in Options.__dataclass_fields__:
             raise document.make_unknown_name_error(
@@ -488,11 +502,9 @@ def _options(document: Document, given: Mapping[str, Any]) -> Options:
 def get_robot_name(name: str) -> str:
     """Return the name of a robot in a dataset: its name, or that of its file or folder."""
     path = Path(name)
-    return (
-        (path.parent.name if path.name == "robot.yaml" else path.stem)
-        if len(path.parts) > 1
-        else name
-    )
+    if len(path.parts) == 1:
+        return name
+    return path.parent.name if path.name == "robot.yaml" else path.stem
 
 
 def is_path(name: str) -> bool:
@@ -500,64 +512,67 @@ def is_path(name: str) -> bool:
     return name.endswith((".yaml", ".yml", ".urdf")) or "/" in name
 
 
-def _robots(
+def _find_robots(
     document: Document, entries: Sequence[RobotEntry], folder: Path
 ) -> tuple[RobotEntry, ...]:
-    found: dict[str, str] = {}
-    robots = []
+    """Return the entries, with the files of robots that are given by path."""
+    sources: dict[str, str] = {}  # by the robots' names in the dataset
+    robots: list[RobotEntry] = []
     for k, entry in enumerate(entries):
-        if is_path(entry.name) and not (folder / entry.name).exists():
+        path = folder / entry.name
+        if is_path(entry.name) and not path.exists():
             raise document.make_error(
                 ("robots", k),
                 "there is no such file",
                 expected="a URDF file, a robot.yaml, or a robot's name",
-                got=(folder / entry.name).resolve(),
+                got=path.resolve(),
             )
+        robot = entry
         with document.annotate_errors(("robots", k)):
-            path = find_robot(
-                str((folder / entry.name).resolve()) if is_path(entry.name) else entry.name
-            )
-        robots.append(
-            entry.model_copy(update={"name": str(path)}) if is_path(entry.name) else entry
-        )
-        name = robots[-1].name
-        if found.setdefault(get_robot_name(name), name) != name:
+            if is_path(entry.name):
+                file = find_robot(str(path.resolve()))
+                robot = entry.model_copy(update={"name": str(file)})
+            else:
+                find_robot(entry.name)
+        robots.append(robot)
+        if sources.setdefault(get_robot_name(robot.name), robot.name) != robot.name:
             raise document.make_error(
                 ("robots", k),
                 "two robots of one name",
                 expected="folders of different names",
-                got=name,
+                got=robot.name,
             )
     return tuple(robots)
 
 
-def _object(document: Document, place: int, name: str, folder: Path) -> str:
-    if not is_path(name):
-        if name not in list_openable_types():
-            raise document.make_unknown_name_error(
-                ("objects", place), "object that opens", name, list_openable_types()
-            )
-        return name
-    return _file(document, ("objects", place), folder / name)
+def _find_object(document: Document, place: int, name: str, folder: Path) -> str:
+    """Return the full path of an object's file, or the name of a generator."""
+    if is_path(name):
+        return _find_file(document, ("objects", place), folder / name)
+    known = list_openable_types()
+    if name not in known:
+        raise document.make_unknown_name_error(("objects", place), "object that opens", name, known)
+    return name
 
 
-def _scene(document: Document, place: int, name: str, folder: Path) -> str:
-    if not is_path(name):
-        known = list_resources("scenes", "*.yaml")
-        if name not in known:
-            raise UnknownNameError(
-                "scene",
-                name,
-                known,
-                file=document.file,
-                line=document.find_line(("scenes", place)),
-                field="scenes",
-            )
-        return name
-    return _file(document, ("scenes", place), folder / name)
+def _find_scene(document: Document, place: int, name: str, folder: Path) -> str:
+    """Return the full path of a scene's file, or the name of a scene of the package."""
+    if is_path(name):
+        return _find_file(document, ("scenes", place), folder / name)
+    known = list_resources("scenes", "*.yaml")
+    if name not in known:
+        raise UnknownNameError(
+            "scene",
+            name,
+            known,
+            file=document.file,
+            line=document.find_line(("scenes", place)),
+            field="scenes",
+        )
+    return name
 
 
-def _file(document: Document, path: tuple[str | int, ...], file: Path) -> str:
+def _find_file(document: Document, path: tuple[str | int, ...], file: Path) -> str:
     if not file.is_file():
         raise document.make_error(
             path, "there is no such file", expected="an existing file", got=file

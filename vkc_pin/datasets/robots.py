@@ -68,23 +68,25 @@ def prepare_robots(recipe: Recipe, folder: Path) -> dict[str, str]:
         warnings.simplefilter("ignore")  # the robot's folder lists guesses
         if recipe.fields.scenes:
             return _prepare_robots_of_scenes(recipe.fields.scenes, folder)
-        found = {}
+        found: dict[str, str] = {}
         for entry in recipe.fields.robots:
-            made = folder / check_name(get_robot_name(entry.name), "robots")
-            if not (made / "robot.yaml").is_file():
-                if not (robot := load_robot(entry.name)).touch_links:
-                    import_robot(find_robot(entry.name), made, samples=_SAMPLES)
+            target = folder / check_name(get_robot_name(entry.name), "robots")
+            if not (target / "robot.yaml").is_file():
+                robot = load_robot(entry.name)
+                if not robot.touch_links:
+                    import_robot(find_robot(entry.name), target, samples=_SAMPLES)
                 elif Path(entry.name).is_absolute():
-                    _copy_robot(robot, find_robot(entry.name), made)
+                    _copy_robot(robot, find_robot(entry.name), target)
                 else:
                     continue
-            found[entry.name] = str((made / "robot.yaml").resolve())
+            found[entry.name] = str((target / "robot.yaml").resolve())
     return found
 
 
 def _prepare_robots_of_scenes(scenes: Sequence[str], folder: Path) -> dict[str, str]:
     """Copy the robots that scenes give by path; see `prepare_robots`."""
-    found, sources = dict[str, str](), dict[str, Path]()
+    found: dict[str, str] = {}
+    sources: dict[str, Path] = {}
     for name in scenes:
         scene = load_scene(name)
         given = str(scene.document["robot"]["name"])
@@ -116,6 +118,5 @@ def _copy_robot(robot: Robot, source: Path, folder: Path) -> None:
         about["srdf"] = f"{robot.urdf.stem}.srdf"
         write_atomically(folder / about["srdf"], srdf.read_bytes())
     write_atomically(folder / about["urdf"], ElementTree.tostring(root, encoding="utf-8"))
-    write_atomically(
-        folder / "robot.yaml", yaml.safe_dump(about, sort_keys=False, allow_unicode=True).encode()
-    )
+    text = yaml.safe_dump(about, sort_keys=False, allow_unicode=True)
+    write_atomically(folder / "robot.yaml", text.encode())

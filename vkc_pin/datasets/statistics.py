@@ -30,8 +30,14 @@ _STYLE = (
     ".grid{display:grid;grid-template-columns:repeat(auto-fill,minmax(26em,1fr));gap:1em}"
     "figure{margin:0}figcaption{font-size:13px;color:#555}.bad{color:#b00}"
 )
-_LISTED = 15  # rows of a table
-_CELLS = 10  # of every interval, whose share with an episode is the coverage
+# rows of a table
+_LISTED = 15
+# equal parts of every interval; the fraction with an episode is the coverage
+_CELLS = 10
+# [m] side of the squares of the floor that are counted
+_SQUARE = 0.5
+# characters of a reason for failure
+_REASON_LENGTH = 140
 
 
 def make_statistics_page(
@@ -52,33 +58,39 @@ def make_statistics_page(
         refused: Number of each invalid episode → reason.
         problems: Other problems.
     """
-    name, attempts = html.escape(recipe.fields.name), len(records) + len(failures)
+    name = html.escape(recipe.fields.name)
+    attempts = len(records) + len(failures)
     hours = sum(float(record["duration"]) for record in records) / 3600.0
     invalid = [f"episode {number}: {reason}" for number, reason in refused.items()]
     verdict = "All of them are valid."
     if refused:
         verdict = f'<span class="bad">{len(refused)} of them are invalid.</span>'
+    histograms = _render_svg(_draw_histograms(records)) if records else ""
+    pictures = "".join(_make_picture(episode) for episode in pictured)
     parts = [
         f"<h1>{name}</h1><p>{len(records)} episodes, {hours:.2f} h, of {attempts} attempts; "
         f"recipe {recipe.digest}. {verdict}</p>",
-        _list("Problems", [*invalid, *problems]),
+        _make_list("Problems", [*invalid, *problems]),
         "<h2>Episodes</h2>",
-        *(_counts(field, records) for field in ("task", "robot", "kind")),
+        _make_table_of_counts("task", records),
+        _make_table_of_counts("robot", records),
+        _make_table_of_counts("kind", records),
         "<h2>Coverage</h2>",
-        _coverage(recipe, records),
-        _svg(_histograms(records)) if records else "",
+        _make_table_of_coverage(recipe, records),
+        histograms,
         "<h2>Homotopy classes</h2>",
-        _windings(records),
+        _make_table_of_classes(records),
         "<h2>Failed attempts</h2>",
-        _failures(failures),
+        _make_table_of_failures(failures),
         "<h2>Ten random episodes</h2>",
-        f'<div class="grid">{"".join(map(_picture, pictured))}</div>',
+        f'<div class="grid">{pictures}</div>',
     ]
     head = f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{name}</title>'
     return f"{head}<style>{_STYLE}</style></head><body>{''.join(parts)}</body></html>\n"
 
 
-def _list(title: str, lines: Sequence[str]) -> str:
+def _make_list(title: str, lines: Sequence[str]) -> str:
+    """Return a list of lines under a title; "" without lines."""
     if not lines:
         return ""
     shown = "".join(f"<li>{html.escape(line)}</li>" for line in lines[:_LISTED])
@@ -86,49 +98,56 @@ def _list(title: str, lines: Sequence[str]) -> str:
     return f'<h2 class="bad">{title}</h2><ul>{shown}{more}</ul>'
 
 
-def _rows(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    def cells(texts: Sequence[str], tag: str) -> str:
-        return "".join(f"<{tag}>{html.escape(text)}</{tag}>" for text in texts)
-
-    body = "".join(f"<tr>{cells(row, 'td')}</tr>" for row in rows)
-    return f"<table><tr>{cells(head, 'th')}</tr>{body}</table>"
+def _make_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table of texts."""
+    body = "".join(_make_row(row, "td") for row in rows)
+    return f"<table>{_make_row(head, 'th')}{body}</table>"
 
 
-def _counts(field: str, records: Sequence[Mapping[str, Any]]) -> str:
-    rows = []
+def _make_row(texts: Sequence[str], tag: str) -> str:
+    cells = "".join(f"<{tag}>{html.escape(text)}</{tag}>" for text in texts)
+    return f"<tr>{cells}</tr>"
+
+
+def _make_table_of_counts(field: str, records: Sequence[Mapping[str, Any]]) -> str:
+    """Return a table of the episodes by the values of a field."""
+    rows: list[list[str]] = []
     for name, count in Counter(str(record[field]) for record in records).most_common():
         own = [record for record in records if str(record[field]) == name]
         duration = np.median([float(record["duration"]) for record in own])
         length = np.median([float(record["base_path_length"]) for record in own])
         scenes = len({record["scene"] for record in own})
         rows.append([name, str(count), f"{duration:.1f}", f"{length:.2f}", str(scenes)])
-    return _rows([field, "episodes", "duration, median [s]", "base, median [m]", "scenes"], rows)
+    head = [field, "episodes", "duration, median [s]", "base, median [m]", "scenes"]
+    return _make_table(head, rows)
 
 
-def _coverage(recipe: Recipe, records: Sequence[Mapping[str, Any]]) -> str:
-    """Return the share of the recipe's ranges that is covered."""
+def _make_table_of_coverage(recipe: Recipe, records: Sequence[Mapping[str, Any]]) -> str:
+    """Return a table of how much of the recipe's ranges is covered."""
     if not records:
         return "<p>There are no episodes.</p>"
     headings = [float(record["start"][2]) % (2.0 * np.pi) for record in records]
     covered = compute_coverage(headings, 0.0, 2.0 * np.pi, _CELLS)
     starts = np.array([record["start"][:2] for record in records])
-    cells = {tuple(cell) for cell in np.floor(starts / 0.5).astype(int).tolist()}
+    squares = {tuple(square) for square in np.floor(starts / _SQUARE).astype(int).tolist()}
+    rooms = {record["room"] for record in records}
     objects = {(record["scene"], record["object"]) for record in records}
     attachments = {(record["kind"], record["attachment"]) for record in records}
     rows = [
         ["start headings of the base, in 10 equal sectors", f"{100.0 * covered:.0f} %"],
-        ["cells of 0.5 m on the floor with a start", str(len(cells))],
-        ["rooms", str(len({record["room"] for record in records}))],
+        ["cells of 0.5 m on the floor with a start", str(len(squares))],
+        ["rooms", str(len(rooms))],
         ["different objects", str(len(objects))],
         ["attachments", str(len(attachments))],
     ]
-    if missing := set(recipe.fields.tasks) - {str(record["task"]) for record in records}:
+    missing = set(recipe.fields.tasks) - {str(record["task"]) for record in records}
+    if missing:
         rows.append(["tasks of the recipe without an episode", ", ".join(sorted(missing))])
-    return _rows(["quantity", "found"], rows)
+    return _make_table(["quantity", "found"], rows)
 
 
-def _windings(records: Sequence[Mapping[str, Any]]) -> str:
-    """Return the number of homotopy classes."""
+def _make_table_of_classes(records: Sequence[Mapping[str, Any]]) -> str:
+    """Return a table of homotopy classes."""
     counted = Counter(len(record["winding"]) for record in records)
     classes = {(record["room"], str(record["winding"])) for record in records}
     rooms = len({record["room"] for record in records})
@@ -136,23 +155,26 @@ def _windings(records: Sequence[Mapping[str, Any]]) -> str:
         "Winding numbers of the base path about each object in the room, relative to the straight "
         f"line between its ends: {len(classes)} pairs of a room and a class, in {rooms} rooms."
     )
-    rows = [
-        [f"around {number} objects" if number else "as the straight line", str(count)]
-        for number, count in sorted(counted.items())
-    ]
-    return f"<p>{text}</p>" + _rows(["path of the base", "episodes"], rows)
+    rows: list[list[str]] = []
+    for number, count in sorted(counted.items()):
+        path = f"around {number} objects" if number else "as the straight line"
+        rows.append([path, str(count)])
+    return f"<p>{text}</p>" + _make_table(["path of the base", "episodes"], rows)
 
 
-def _failures(failures: Sequence[Mapping[str, str]]) -> str:
-    counted = Counter(
-        (row["task"] or "–", row["status"], re.sub(r"[-\d.]+", "#", row["reason"])[:140])
-        for row in failures
-    )
+def _make_table_of_failures(failures: Sequence[Mapping[str, str]]) -> str:
+    """Return a table of failed attempts by task, status and reason, whose numbers do not count."""
+    counted = Counter[tuple[str, str, str]]()
+    for row in failures:
+        reason = re.sub(r"[-\d.]+", "#", row["reason"])
+        counted[row["task"] or "–", row["status"], reason[:_REASON_LENGTH]] += 1
+    if not counted:
+        return "<p>None.</p>"
     rows = [[*key, str(count)] for key, count in counted.most_common(_LISTED)]
-    return _rows(["task", "status", "reason", "attempts"], rows) if rows else "<p>None.</p>"
+    return _make_table(["task", "status", "reason", "attempts"], rows)
 
 
-def _histograms(records: Sequence[Mapping[str, Any]]) -> Figure:
+def _draw_histograms(records: Sequence[Mapping[str, Any]]) -> Figure:
     """Draw durations, path lengths, clearances, goals and starts."""
     tasks = sorted({str(record["task"]) for record in records})
     fields = {
@@ -165,11 +187,17 @@ def _histograms(records: Sequence[Mapping[str, Any]]) -> Figure:
         figure = new_figure(10.0, 5.6)
         *axes, goal_axes, start_axes = figure.subplots(2, 3).ravel()
         for own, (field, label) in zip(axes, fields.items(), strict=True):
-            columns = [
-                [float(r[field]) for r in records if r["task"] == task and field in r]
-                for task in tasks
-            ]
-            own.hist(columns, bins=24, stacked=True, color=COLOURS[: len(tasks)], label=tasks)
+            columns: dict[str, list[float]] = {task: [] for task in tasks}
+            for record in records:
+                if field in record:
+                    columns[record["task"]].append(float(record[field]))
+            own.hist(
+                list(columns.values()),
+                bins=24,
+                stacked=True,
+                color=COLOURS[: len(tasks)],
+                label=tasks,
+            )
             own.set(xlabel=label, ylabel="episodes")
         axes[0].legend(fontsize=8)
         goals = [
@@ -183,7 +211,7 @@ def _histograms(records: Sequence[Mapping[str, Any]]) -> Figure:
         return figure
 
 
-def _svg(figure: Figure) -> str:
+def _render_svg(figure: Figure) -> str:
     """Return a figure as reproducible SVG."""
     import matplotlib
 
@@ -193,13 +221,17 @@ def _svg(figure: Figure) -> str:
     return re.sub(r"^.*?(?=<svg)", "", buffer.getvalue(), flags=re.DOTALL)
 
 
-def _picture(episode: Episode) -> str:
+def _make_picture(episode: Episode) -> str:
     """Return a top view of an episode with a caption."""
     with use_style():
         figure = new_figure(5.2, 4.6)
         draw_top_view(figure, World(episode.scene()), episode.trajectory)
-        picture = _svg(figure)
-    about, times = episode.about, episode.trajectory.times
-    caption = f"{episode.number}: {about['task']}, {about['robot']}, {about['kind']} in "
-    caption += f"{about['room']}, {float(times[-1] - times[0]):.1f} s"
+        picture = _render_svg(figure)
+    about = episode.about
+    times = episode.trajectory.times
+    duration = float(times[-1] - times[0])
+    caption = (
+        f"{episode.number}: {about['task']}, {about['robot']}, {about['kind']} in "
+        f"{about['room']}, {duration:.1f} s"
+    )
     return f"<figure>{picture}<figcaption>{html.escape(caption)}</figcaption></figure>"

@@ -35,9 +35,12 @@ from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate, Grasp, Place, Step
 
 WINDOW = 2
-ONE_CALL, STEP_BY_STEP = "VKC", "step by step"
-THINGS = 300  # in the cluttered home
-_AROUND = 0.2  # [m] around the task's objects that stays free of clutter
+ONE_CALL = "VKC"
+STEP_BY_STEP = "step by step"
+# objects in the cluttered home
+THINGS = 300
+# [m] around the task's objects that stays free of clutter
+_AROUND = 0.2
 # Eighteen steps take half a million evaluations and more.
 _LIMITS = {**LIMITS, "max_evaluations": 4 * LIMITS["max_evaluations"]}
 
@@ -49,11 +52,16 @@ _SEEDS_ABOUT = (
     "fails."
 )
 
-BAR_TABLE = (-3.0, 1.3, 1.051)  # [m], where the cup stands in between
+# Positions of placed objects in the world frame [m].
+# where the cup stands in between
+BAR_TABLE = (-3.0, 1.3, 1.051)
 DESK = (1.75, 3.5, 0.741)
-CLEAR = (1.1, -2.9, 0.036)  # floor before the television
-BIN = (3.0, -3.6, 0.16)  # within its walls; released objects would fall
-BEFORE_TABLE = (-0.9, 2.2, 0.036)  # floor before the low table
+# floor before the television
+CLEAR = (1.1, -2.9, 0.036)
+# within its walls; released objects would fall
+BIN = (3.0, -3.6, 0.16)
+# floor before the low table
+BEFORE_TABLE = (-0.9, 2.2, 0.036)
 SHELF = (-4.61, -1.0, 0.846)
 
 
@@ -97,7 +105,7 @@ def fetch(scene: Scene) -> list[Step]:
     ]
 
 
-def _box(name: str, *sides: tuple[float, float], colour: str = "white") -> dict[str, Any]:
+def _make_box(name: str, *sides: tuple[float, float], colour: str = "white") -> dict[str, Any]:
     """Return a box obstacle, given by its range along x, y and z [m]."""
     size = [round(high - low, 4) for low, high in sides]
     middle = [round((low + high) / 2.0, 5) for low, high in sides]
@@ -107,16 +115,16 @@ def _box(name: str, *sides: tuple[float, float], colour: str = "white") -> dict[
 TIGHT: tuple[dict[str, Any], ...] = (
     # The narrow door's leaf stands 50 mm in the wall above it, and 20 mm in that beside its hinge,
     # wherever it is.
-    _box("casing_above", (1.105, 2.01), (1.2, 1.3), (1.945, 2.07), colour="wall"),
-    _box("casing_beside", (1.105, 1.22), (1.2, 1.3), (0.0, 2.07), colour="wall"),
+    _make_box("casing_above", (1.105, 2.01), (1.2, 1.3), (1.945, 2.07), colour="wall"),
+    _make_box("casing_beside", (1.105, 1.22), (1.2, 1.3), (0.0, 2.07), colour="wall"),
     # The refrigerator's door touches the panel on its hinge's side, and is 9 mm from that beside
     # the kitchen.
-    _box("panel_east", (-1.255, -1.235), (3.354, 4.0), (0.0, 2.1)),
-    _box("panel_west", (-1.889, -1.859), (3.3, 4.0), (0.0, 2.1)),
+    _make_box("panel_east", (-1.255, -1.235), (3.354, 4.0), (0.0, 2.1)),
+    _make_box("panel_west", (-1.889, -1.859), (3.3, 4.0), (0.0, 2.1)),
     # 10 mm from the narrow door's levers: a bag that hangs from its frame, and a wardrobe, once the
     # door is open as far as asked.
-    _box("bag", (1.875, 1.985), (1.11, 1.19), (0.8, 1.04), colour="teal"),
-    _box("wardrobe", (0.2, 1.099), (1.3, 1.9), (0.0, 2.0), colour="oak"),
+    _make_box("bag", (1.875, 1.985), (1.11, 1.19), (0.8, 1.04), colour="teal"),
+    _make_box("wardrobe", (0.2, 1.099), (1.3, 1.9), (0.0, 2.0), colour="oak"),
     # 10 mm from carried objects: a bottle behind the cup in the refrigerator, a mop between broom
     # and wall.
     {
@@ -142,13 +150,14 @@ TIGHT: tuple[dict[str, Any], ...] = (
 @functools.cache
 def make_cluttered_home() -> Scene:
     """Return the scene `household` with `TIGHT` and 300 more objects: 561 convex shapes."""
-    home, places = load_scene("household"), (BAR_TABLE, DESK, CLEAR, BIN)
+    home = load_scene("household")
+    document = home.document
+    document["obstacles"] = [*document["obstacles"], *TIGHT]
+    clear = [(place, _AROUND) for place in (BAR_TABLE, DESK, CLEAR, BIN)]
     # Leaves overlap their walls, which is meant.
     with warnings.catch_warnings(action="ignore", category=UserWarning):
-        tight = Scene.from_document(
-            {**home.document, "obstacles": [*home.document["obstacles"], *TIGHT]}, home.folder
-        )
-        return add_clutter(tight, THINGS, clear=[(place, _AROUND) for place in places])
+        tight = Scene.from_document(document, home.folder)
+        return add_clutter(tight, THINGS, clear=clear)
 
 
 @dataclass(frozen=True)
@@ -207,25 +216,26 @@ def run(
         step_by_step: Whether to plan the steps one by one as well.
         solve: Plans a trial in one call.
     """
-    chores, specs = runner.select_names("chore", chores, CHORES), list[dict[str, Any]]()
-    methods = (ONE_CALL, *((STEP_BY_STEP,) if step_by_step else ()))
+    chores = runner.select_names("chore", chores, CHORES)
+    methods = (ONE_CALL, STEP_BY_STEP) if step_by_step else (ONE_CALL,)
+    specs: list[dict[str, Any]] = []
     for chore in chores:
         scene = CHORES[chore].scene()
         rng = np.random.default_rng([seed, list(CHORES).index(chore)])
         for number in range(trials):
-            base = (scene.sample_start(rng) if number else scene).start[:3].tolist()
-            for own, method in itertools.product(range(seed, seed + seeds), methods):
-                key = f"{chore}/{number:04d}/{own:04d}/{method}"
+            start = scene.sample_start(rng) if number else scene
+            for planning_seed, method in itertools.product(range(seed, seed + seeds), methods):
                 specs.append(
                     {
-                        "key": key,
+                        "key": f"{chore}/{number:04d}/{planning_seed:04d}/{method}",
                         "scene": chore,
                         "number": number,
-                        "base": base,
-                        "seed": own,
+                        "base": start.start[:3].tolist(),
+                        "seed": planning_seed,
                         "method": method,
                     }
                 )
+    steps = {name: [str(step) for step in CHORES[name].list_steps()] for name in chores}
     settings = {
         "benchmark": "chores",
         "seed": seed,
@@ -233,13 +243,11 @@ def run(
         "seeds": seeds,
         "methods": methods,
         "chores": chores,
-    }
-    settings |= {
         "window": WINDOW,
         **_LIMITS,
-        "steps": {name: list(map(str, CHORES[name].list_steps())) for name in chores},
+        "steps": steps,
+        "dist_safe": {name: CHORES[name].options.dist_safe for name in chores},
     }
-    settings |= {"dist_safe": {name: CHORES[name].options.dist_safe for name in chores}}
     return runner.run(
         specs,
         functools.partial(_record, solve=solve),
@@ -252,59 +260,76 @@ def run(
 
 def format_results(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown."""
-    about, records, rows = result["meta"], result["trials"], []
-    seeds, methods = about.get("seeds", 1), about.get("methods", [ONE_CALL])
-    for chore in about["chores"]:
-        own = select(records, scene=chore, method=ONE_CALL)
-        late = format_decimal(distribution(own, "planning_time")[1])
-        lengths = format_medians(
-            select(own, success=True), "base_path_length", "arm_path_length", "duration"
-        )
-        steps = str(len(about["steps"][chore]))
-        times = format_medians(own, "wall_time", "planning_time")
-        rows.append([chore, steps, count(own), *times, late, *lengths, count_failures(own)])
-    times_head = ["in all, median [s]", "planning, median [s]", "95th percentile [s]"]
-    lengths_head = ["base [m]", "arm [rad]", "duration [s]", "failures"]
-    fields = ("wall_time", "planning_time", "base_path_length", "arm_path_length")
-    every = []
-    for r in records:
-        cells = [r["scene"], str(r["number"]), str(r["seed"]), _METHODS[r["method"]], r["status"]]
-        every.append([*cells, *(format_decimal(r.get(field) or float("nan")) for field in fields)])
-    head = ["chore", "start", "seed", "planned", "status", "in all [s]", "planning [s]"]
+    about = result["meta"]
+    seeds = about.get("seeds", 1)
+    methods = about.get("methods", [ONE_CALL])
     parts = [
         "# Chores",
         f"Each chore in one call, from {about['starts']} starts, the first of them the scene's "
         f"own, with {seeds} seeds each from {about['seed']} on; a window of {about['window']} "
         f"actions. {JUDGED} The time in all includes building symbolic programs; path lengths "
         "and durations are medians of successes.",
-        format_table(["chore", "steps", "success", *times_head, *lengths_head], rows),
+        _tabulate_chores(result),
     ]
     if seeds > 1 or len(methods) > 1:
-        parts += ["## Seeds", _SEEDS_ABOUT, _seeds_table(result)]
-    parts += ["## Every trial", format_table([*head, "base [m]", "arm [rad]"], every, text=5)]
+        parts += ["## Seeds", _SEEDS_ABOUT, _tabulate_seeds(result)]
+    parts += ["## Every trial", _tabulate_trials(result)]
     return join_sections(about, *parts)
 
 
-def _seeds_table(result: Mapping[str, Any]) -> str:
-    """Tabulate the dependence on the planning seed by chore, start and method."""
-    groups = dict[tuple[str, int, str], list[Record]]()
+def _tabulate_chores(result: Mapping[str, Any]) -> str:
+    """Tabulate the trials in one call by chore."""
+    rows: list[list[str]] = []
+    for chore in result["meta"]["chores"]:
+        own = select(result["trials"], scene=chore, method=ONE_CALL)
+        successes = select(own, success=True)
+        steps = str(len(result["meta"]["steps"][chore]))
+        times = format_medians(own, "wall_time", "planning_time")
+        late = format_decimal(distribution(own, "planning_time")[1])
+        lengths = format_medians(successes, "base_path_length", "arm_path_length", "duration")
+        rows.append([chore, steps, count(own), *times, late, *lengths, count_failures(own)])
+    head = ["chore", "steps", "success"]
+    head += ["in all, median [s]", "planning, median [s]", "95th percentile [s]"]
+    head += ["base [m]", "arm [rad]", "duration [s]", "failures"]
+    return format_table(head, rows)
+
+
+def _tabulate_trials(result: Mapping[str, Any]) -> str:
+    """Tabulate every trial."""
+    rows: list[list[str]] = []
     for record in result["trials"]:
-        groups.setdefault((record["scene"], record["number"], record["method"]), []).append(record)
-    rows = []
+        row = [record["scene"], str(record["number"]), str(record["seed"])]
+        row += [_METHODS[record["method"]], record["status"]]
+        for name in ("wall_time", "planning_time", "base_path_length", "arm_path_length"):
+            row.append(format_decimal(record.get(name) or float("nan")))
+        rows.append(row)
+    head = ["chore", "start", "seed", "planned", "status", "in all [s]", "planning [s]"]
+    head += ["base [m]", "arm [rad]"]
+    return format_table(head, rows, text=5)
+
+
+def _tabulate_seeds(result: Mapping[str, Any]) -> str:
+    """Tabulate the dependence on the planning seed by chore, start and method."""
+    groups: dict[tuple[str, int, str], list[Record]] = {}
+    for record in result["trials"]:
+        group = (record["scene"], record["number"], record["method"])
+        groups.setdefault(group, []).append(record)
+    rows: list[list[str]] = []
     for (chore, number, method), own in groups.items():
-        steps, times = len(result["meta"]["steps"][chore]), values(own, "cpu_time")
-        counts = ["all" if n == steps else f"{n:.0f}" for n in values(own, "steps_done")]
-        spreads = list[str]()
+        row = [chore, str(number), _METHODS[method], count(own)]
+        steps = len(result["meta"]["steps"][chore])
+        done = ["all" if n == steps else f"{n:.0f}" for n in values(own, "steps_done")]
+        row.append(", ".join(done) or "–")
+        times = values(own, "cpu_time")
+        if times:
+            row += [format_decimal(float(np.median(times))), format_decimal(max(times))]
+        else:
+            row += ["–", "–"]
+        successes = select(own, success=True)
         for length in ("base_path_length", "arm_path_length"):
-            found = values(select(own, success=True), length)
-            spreads += _format_spread(min(found), max(found)) if found else ["–"] * 3
-        cpu = (
-            (format_decimal(float(np.median(times))), format_decimal(max(times)))
-            if times
-            else ("–", "–")
-        )
-        done = ", ".join(counts) or "–"
-        rows.append([chore, str(number), _METHODS[method], count(own), done, *cpu, *spreads])
+            lengths = values(successes, length)
+            row += _format_spread(min(lengths), max(lengths)) if lengths else ["–", "–", "–"]
+        rows.append(row)
     head = ["chore", "start", "planned", "success", "steps done", "CPU, median [s]", "most [s]"]
     head += ["base [m]", "spread [%]", "±[%]", "arm [rad]", "spread [%]", "±[%]"]
     return format_table(head, rows, text=3)
@@ -312,31 +337,34 @@ def _seeds_table(result: Mapping[str, Any]) -> str:
 
 def _format_spread(low: float, high: float) -> list[str]:
     """Return a range, its spread over the lower end, and half of it over the middle [%]."""
-    shares = (high / low - 1.0, (high - low) / (high + low)) if low > 0.0 else (np.nan, np.nan)
-    return [
-        f"{low:.1f}–{high:.1f}",
-        *("–" if np.isnan(share) else f"{100.0 * share:.0f}" for share in shares),
-    ]
+    span = f"{low:.1f}–{high:.1f}"
+    if not low > 0.0:
+        return [span, "–", "–"]
+    spread = high / low - 1.0
+    half = (high - low) / (high + low)
+    return [span, f"{100.0 * spread:.0f}", f"{100.0 * half:.0f}"]
 
 
 def _record(spec: dict[str, Any], solve: Solve) -> dict[str, Any]:
+    """Plan a trial and return its record."""
     chore = CHORES[spec["scene"]]
     scene = chore.scene().with_start(base=spec["base"])
     steps = chore.steps(scene)
-    began, before = time.perf_counter(), time.process_time()
     about = {"method": spec["method"], "seed": spec["seed"]}
-    more: dict[str, Any] = {"number": spec["number"]}
+    fields: dict[str, Any] = {"number": spec["number"]}
+    began = time.perf_counter()
+    cpu_began = time.process_time()
     if spec["method"] == STEP_BY_STEP:
         plans = stepwise.plan_step_by_step(scene, steps, options=chore.options, seed=spec["seed"])
-        more |= {"wall_time": time.perf_counter() - began, "cpu_time": time.process_time() - before}
-        return {
-            **stepwise.combine_records(plans, len(steps), **about, **more),
-            "scene": spec["scene"],
-        }
-    plan = solve(scene, spec)
-    more |= {"wall_time": time.perf_counter() - began, "cpu_time": time.process_time() - before}
-    more |= {
-        "duration": plan.trajectory.metrics()["duration"],
-        "steps_done": len(steps) if plan.success else None,
-    }
-    return {**trial(plan, **about, **more), "scene": spec["scene"]}
+        fields["wall_time"] = time.perf_counter() - began
+        fields["cpu_time"] = time.process_time() - cpu_began
+        record = stepwise.combine_records(plans, len(steps), **about, **fields)
+    else:
+        plan = solve(scene, spec)
+        fields["wall_time"] = time.perf_counter() - began
+        fields["cpu_time"] = time.process_time() - cpu_began
+        fields["duration"] = plan.trajectory.metrics()["duration"]
+        fields["steps_done"] = len(steps) if plan.success else None
+        record = trial(plan, **about, **fields)
+    record["scene"] = spec["scene"]
+    return record

@@ -152,19 +152,20 @@ def add_choice(parser: argparse.ArgumentParser, names: str, choices: str) -> Non
 
 
 def _bench_door(arguments: argparse.Namespace) -> int:
+    """Run the experiment at the door and print its table."""
     from vkc_pin.experiments import door
     from vkc_pin.world.files.writing import check_outputs, write_atomically
 
     if arguments.json is not None:
         check_outputs({"--json": arguments.json})
+    progress = not arguments.quiet
     with raise_on_interrupt():
-        result = door.run(
-            trials=arguments.trials, seed=arguments.seed, progress=not arguments.quiet
-        )
+        result = door.run(trials=arguments.trials, seed=arguments.seed, progress=progress)
     text = door.table(result) + "\n"
     if arguments.json is not None:
-        data = (json.dumps(result, indent=1) + "\n").encode()
-        text += f"wrote {write_atomically(arguments.json, data)}\n"
+        document = json.dumps(result, indent=1) + "\n"
+        path = write_atomically(arguments.json, document.encode())
+        text += f"wrote {path}\n"
     sys.stdout.write(text)
     return EXIT_OK
 
@@ -172,12 +173,10 @@ def _bench_door(arguments: argparse.Namespace) -> int:
 def _bench_experiment(arguments: argparse.Namespace) -> int:
     """Run an experiment and print its table, or how to resume it."""
     experiment = importlib.import_module(arguments.module)
-    others = ("run", "module", "command", "quiet")
-    settings = {
-        name: value
-        for name, value in vars(arguments).items()
-        if value is not None and name not in others
-    }
+    settings = dict(vars(arguments))
+    for name in ("run", "module", "command", "quiet"):
+        settings.pop(name, None)
+    settings = {name: value for name, value in settings.items() if value is not None}
     try:
         with raise_on_interrupt():
             experiment.run(**settings, progress=not arguments.quiet)

@@ -39,7 +39,9 @@ from vkc_pin.experiments.harness.tables import (
     describe_run,
     find_common_successes,
     format_decimal,
+    format_medians,
     format_table,
+    select,
 )
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner, plan
@@ -50,6 +52,10 @@ from vkc_pin.world.task.steps import Actuate, GoTo, Place, Step
 
 WAYPOINTS = {f"{method}x{finer}": (method, finer) for finer in (1, 3) for method in BASELINES}
 """Baselines with other numbers of waypoints: name → method, multiple of VKC's number."""
+_OWN = "VKC"
+COMPARED_PLANNERS = (*BASELINES, _OWN)
+METHODS = (*BASELINES, *WAYPOINTS, _OWN)
+"""All methods, in the order of the tables."""
 
 CRITERIA = {
     **EFFORTS,
@@ -59,10 +65,7 @@ CRITERIA = {
 }
 """What motions are compared by: field → name."""
 BUDGETS = {"1/10": 0.1, "1/3": 1 / 3, "2/3": 2 / 3, "whole budget": 1.0}
-"""Name → share of the budget."""
-_OWN = "VKC"
-COMPARED_PLANNERS = (*BASELINES, "VKC")
-METHODS = (*COMPARED_PLANNERS[:-1], *WAYPOINTS, "VKC")  # in the order of the tables
+"""Name → fraction of the budget."""
 COLD = 5
 """Number of trials of a task and method that are planned twice, cold and warm."""
 Draw = Callable[[Sequence[Record], Path, Mapping[str, str], Sequence[str]], list[str]]
@@ -91,36 +94,36 @@ def format_results(
         saved: Key → file, of failures whose plans are saved.
         pictures: Pictures in Markdown.
     """
-    about, records = result["meta"], result["trials"]
+    about = result["meta"]
+    records = result["trials"]
     methods = about["methods"]
     compared = select_compared_methods(methods)
     *first, last = (f"`{task}`: {name}" for task, name in tasks.items())
+    listed = f"{', '.join(first)} and {last}" if first else last
+    starts = f"{about['starts']} random {'start' if about['starts'] == 1 else 'starts'}"
+    common = _count_common_successes(records, tasks, compared)
     parts = [
         f"# {title}",
-        f"{', '.join(first)}{' and ' * bool(first)}{last}. {about['starts']} random "
-        f"start{'s' * (about['starts'] != 1)} per task, the same for all methods; seed "
-        f"{about['seed']}. Per "
+        f"{listed}. {starts} per task, the same for all methods; seed {about['seed']}. Per "
         f"trial {describe_limit(about)}, in which the baselines try up to {about['retries']} "
         "times. "
         "Success is the result of the independent validation. Standard deviations are those of "
         "samples (n − 1).",
         "## Success",
-        _success(records, tasks, methods),
+        _tabulate_success(records, tasks, methods),
         "## Planning time",
         "Without imports and symbolic build. The last column is the ratio of medians to VKC.",
-        _times(records, tasks, methods),
-        *_calls(records, tasks, methods),
-        *_budgets(about, records, tasks, methods),
+        _tabulate_times(records, tasks, methods),
+        *_describe_calls(records, tasks, methods),
+        *_describe_budgets(about, records, tasks, methods),
         "## Path lengths, peaks and durations where all methods succeed",
-        "Mean ± standard deviation; median. Trials in which all methods succeed: "
-        + _numbers(records, tasks, compared)
-        + ".",
-        _criteria(records, tasks, compared, shared=True),
-        *_pairwise(records, tasks, methods),
+        "Mean ± standard deviation; median. Trials in which all methods succeed: " + common + ".",
+        _tabulate_criteria(records, tasks, compared, shared=True),
+        *_compare_pairs(records, tasks, methods),
         "## Path lengths, peaks and durations over each method's own successes",
         "Mean ± standard deviation; median. The methods succeed in different trials, so that "
         "harder trials count for some methods only.",
-        _criteria(records, tasks, methods, shared=False),
+        _tabulate_criteria(records, tasks, methods, shared=False),
         *pictures,
     ]
     if saved:
@@ -132,20 +135,22 @@ def format_results(
     return "\n\n".join([*parts, describe_run(about)]) + "\n"
 
 
-def _success(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]) -> str:
-    rows = []
-    for task, method in product([*tasks, "all"] if len(tasks) > 1 else tasks, methods):
-        own = [
-            record
-            for record in records
-            if record["method"] == method and task in ("all", record["scene"])
-        ]
-        good = sum(bool(record["success"]) for record in own)
-        low, high = (f"{100.0 * end:.0f}" for end in compute_wilson_interval(good, len(own)))
-        rate = f"{100.0 * good / len(own):.0f}" if own else "–"
-        rows.append(
-            [task, method, f"{good} of {len(own)}", rate, f"{low}–{high}", *count_timeouts(own)]
-        )
+def _tabulate_success(
+    records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]
+) -> str:
+    """Tabulate the success rates of every task and method."""
+    groups = {task: select(records, scene=task) for task in tasks}
+    if len(tasks) > 1:
+        groups["all"] = list(records)
+    rows: list[list[str]] = []
+    for (task, group), method in product(groups.items(), methods):
+        own = select(group, method=method)
+        successes = sum(bool(record["success"]) for record in own)
+        low, high = compute_wilson_interval(successes, len(own))
+        rate = f"{100.0 * successes / len(own):.0f}" if own else "–"
+        interval = f"{100.0 * low:.0f}–{100.0 * high:.0f}"
+        number = f"{successes} of {len(own)}"
+        rows.append([task, method, number, rate, interval, *count_timeouts(own)])
     head = [
         "task",
         "method",
@@ -158,21 +163,23 @@ def _success(records: Sequence[Record], tasks: Mapping[str, str], methods: Seque
     return format_table(head, rows, text=2)
 
 
-def _times(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]) -> str:
-    rows = []
+def _tabulate_times(
+    records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]
+) -> str:
+    """Tabulate the planning times of every task and method."""
+    rows: list[list[str]] = []
     for name, good in (("all trials", False), ("successes", True)):
         for task, method in product(tasks, methods):
-            own, reference = (
-                _select_records(records, task, which, good=good) for which in (method, _OWN)
-            )
-            (median, late), times = distribution(own, "planning_time"), values(own, "planning_time")
-            cells = (
-                median,
-                late,
-                *compute_mean_and_deviation(times),
-                median / distribution(reference, "planning_time")[0],
-            )
-            rows.append([name, task, method, str(len(times)), *map(format_decimal, cells)])
+            own = _select_records(records, task, method, good=good)
+            reference = _select_records(records, task, _OWN, good=good)
+            times = values(own, "planning_time")
+            median, late = distribution(own, "planning_time")
+            mean, deviation = compute_mean_and_deviation(times)
+            reference_median, _ = distribution(reference, "planning_time")
+            ratio = median / reference_median
+            row = [name, task, method, str(len(times))]
+            row += [format_decimal(cell) for cell in (median, late, mean, deviation, ratio)]
+            rows.append(row)
     head = [
         "over",
         "task",
@@ -187,19 +194,20 @@ def _times(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequenc
     return format_table(head, rows, text=3)
 
 
-def _calls(
+def _describe_calls(
     records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]
 ) -> list[str]:
     """Return a section on the time of whole calls, if it is recorded."""
-    rows = []
+    rows: list[list[str]] = []
     for task, method in product(tasks, methods):
         own = _select_records(records, task, method)
         if values(own, "wall_time"):
-            first = [
-                format_decimal(distribution(own, field)[0]) for field in ("cold_time", "warm_time")
-            ]
+            repeated = str(len(values(own, "cold_time")))
+            first = format_medians(own, "cold_time", "warm_time")
             wall = [format_decimal(value) for value in distribution(own, "wall_time")]
-            rows.append([task, method, str(len(values(own, "cold_time"))), *first, *wall])
+            rows.append([task, method, repeated, *first, *wall])
+    if not rows:
+        return []
     head = [
         "task",
         "method",
@@ -214,10 +222,10 @@ def _calls(
         "with empty caches: cold, including construction of the symbolic programs and loading or "
         "compiling them, and warm. All: every trial, in order."
     )
-    return ["## Wall-clock time of calls", text, format_table(head, rows, text=2)] if rows else []
+    return ["## Wall-clock time of calls", text, format_table(head, rows, text=2)]
 
 
-def _budgets(
+def _describe_budgets(
     about: Mapping[str, Any],
     records: Sequence[Record],
     tasks: Mapping[str, str],
@@ -226,24 +234,23 @@ def _budgets(
     """Return a section on successes with smaller budgets, if the budget was limited."""
     if "max_evaluations" not in about or not values(records, "evaluations"):
         return []
-    shares = [(name, about["max_evaluations"] * share) for name, share in BUDGETS.items()]
-    rows = []
+    budget = about["max_evaluations"]
+    rows: list[list[str]] = []
     for task, method in product(tasks, methods):
         own = _select_records(records, task, method)
-        good = values([record for record in own if record["success"]], "evaluations")
-        within = [sum(count <= limit for count in good) for _, limit in shares]
+        successes = _select_records(records, task, method, good=True)
+        evaluations = values(successes, "evaluations")
+        within: list[int] = []  # successes within each fraction of the budget
+        for fraction in BUDGETS.values():
+            limit = budget * fraction
+            within.append(sum(count <= limit for count in evaluations))
         gain = 100.0 * (within[-1] - within[-2]) / max(len(own), 1)
-        most = f"{max(good) / about['max_evaluations']:.3f}" if good else "–"
-        rows.append(
-            [task, method, *(f"{number} of {len(own)}" for number in within), f"{gain:.0f}", most]
-        )
-    head = [
-        "task",
-        "method",
-        *(name for name, _ in shares),
-        "gain from 2/3 [points]",
-        "largest fraction used",
-    ]
+        most = f"{max(evaluations) / budget:.3f}" if evaluations else "–"
+        row = [task, method]
+        row += [f"{number} of {len(own)}" for number in within]
+        row += [f"{gain:.0f}", most]
+        rows.append(row)
+    head = ["task", "method", *BUDGETS, "gain from 2/3 [points]", "largest fraction used"]
     text = (
         "Successes within fractions of the budget. The budget only ends planning, so that these "
         "are the successes with smaller budgets. The gain is that of half as much again, from 2/3 "
@@ -252,94 +259,87 @@ def _budgets(
     return ["## Success with smaller budgets", text, format_table(head, rows, text=2)]
 
 
-def _numbers(records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]) -> str:
+def _count_common_successes(
+    records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]
+) -> str:
     """Return the number of trials of each task in which all methods succeed."""
-    numbers = []
+    counts: list[str] = []
     for task in tasks:
-        own = [record for record in records if record["scene"] == task]
-        numbers.append(
-            f"{len(find_common_successes(own, methods))} of "
-            f"{len({record['number'] for record in own})} ({task})"
-        )
-    return ", ".join(numbers)
+        own = select(records, scene=task)
+        common = len(find_common_successes(own, methods))
+        trials = len({record["number"] for record in own})
+        counts.append(f"{common} of {trials} ({task})")
+    return ", ".join(counts)
 
 
-def _criteria(
+def _tabulate_criteria(
     records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str], *, shared: bool
 ) -> str:
-    """Return all criteria over shared trials, or over each method's own successes."""
-    rows = []
+    """Tabulate all criteria over shared trials, or over each method's own successes."""
+    rows: list[list[str]] = []
     for task in tasks:
-        own = [record for record in records if record["scene"] == task]
-        good = {method: _select_records(own, task, method, good=True) for method in methods}
         if shared:
-            both = find_common_successes(own, methods)
-            good = {method: [row[k] for row in both] for k, method in enumerate(methods)}
-        if not shared:
-            rows.append([task, "n", *(str(len(good[method])) for method in methods)])
+            common = find_common_successes(select(records, scene=task), methods)
+            compared = [[row[k] for row in common] for k in range(len(methods))]
+        else:
+            compared = [_select_records(records, task, method, good=True) for method in methods]
+            rows.append([task, "n", *(str(len(own)) for own in compared)])
         for field, name in CRITERIA.items():
-            rows.append([task, name, *(_spread(good[method], field) for method in methods)])
+            rows.append([task, name, *(_format_spread(own, field) for own in compared)])
     return format_table(["task", "criterion", *methods], rows, text=2)
 
 
-def _pairwise(
+def _compare_pairs(
     records: Sequence[Record], tasks: Mapping[str, str], methods: Sequence[str]
 ) -> list[str]:
     """Return a section that compares VKC with every other method."""
     others = [method for method in methods if method != _OWN]
     if _OWN not in methods or not others:
         return []
-    rows = []
-    for other in others:
-        for task in tasks:
-            both = find_common_successes(
-                [record for record in records if record["scene"] == task], (_OWN, other)
-            )
-            for field, name in {**CRITERIA, "planning_time": "planning time [s]"}.items():
-                medians = (
-                    format_decimal(distribution([row[k] for row in both], field)[0]) for k in (0, 1)
-                )
-                rows.append(
-                    [task, name, other, *medians, f"{count_lower(both, field)} of {len(both)}"]
-                )
+    criteria = {**CRITERIA, "planning_time": "planning time [s]"}
+    rows: list[list[str]] = []
+    for other, task in product(others, tasks):
+        both = find_common_successes(select(records, scene=task), (_OWN, other))
+        for field, name in criteria.items():
+            own_median, _ = distribution([pair[0] for pair in both], field)
+            other_median, _ = distribution([pair[1] for pair in both], field)
+            medians = [format_decimal(own_median), format_decimal(other_median)]
+            lower = f"{count_lower(both, field)} of {len(both)}"
+            rows.append([task, name, other, *medians, lower])
     head = ["task", "criterion", "other", f"{_OWN}, median", "other, median", f"lower with {_OWN}"]
     text = f"Over the trials in which {_OWN} and the other method succeed."
     return [f"## {_OWN} against each baseline", text, format_table(head, rows, text=3)]
 
 
 def _list_failures(records: Sequence[Record], saved: Mapping[str, str]) -> str:
-    rows = []
+    """Tabulate the failures whose plans are saved."""
+    rows: list[list[str]] = []
     for record in records:
         if record["key"] in saved:
-            violated = record["violations"][0] if record["violations"] else "–"
-            cells = [
-                record["scene"],
-                record["number"],
-                record["method"],
-                record["status"],
-                violated,
-                f"`{saved[record['key']]}`",
-            ]
-            rows.append([str(cell) for cell in cells])
-    return format_table(
-        ["task", "trial", "method", "cause", "violated first", "file"], rows, text=6
-    )
+            row = [str(record[field]) for field in ("scene", "number", "method", "status")]
+            row.append(str(record["violations"][0]) if record["violations"] else "–")
+            row.append(f"`{saved[record['key']]}`")
+            rows.append(row)
+    head = ["task", "trial", "method", "cause", "violated first", "file"]
+    return format_table(head, rows, text=6)
 
 
 def _select_records(
     records: Sequence[Record], task: str, method: str, *, good: bool = False
 ) -> list[Record]:
     """Return the records of a task and method, or its successes."""
-    own = (record for record in records if (record["scene"], record["method"]) == (task, method))
+    own = select(records, scene=task, method=method)
     return [record for record in own if record["success"] or not good]
 
 
-def _spread(records: Sequence[Record], field: str) -> str:
+def _format_spread(records: Sequence[Record], field: str) -> str:
+    """Format mean, standard deviation and median of a field; a dash without values."""
     found = values(records, field)
-    mean, deviation = map(format_decimal, compute_mean_and_deviation(found))
-    return (
-        f"{mean} ± {deviation}; {format_decimal(distribution(records, field)[0])}" if found else "–"
-    )
+    if not found:
+        return "–"
+    mean, deviation = compute_mean_and_deviation(found)
+    median, _ = distribution(records, field)
+    return f"{format_decimal(mean)} ± {format_decimal(deviation)}; {format_decimal(median)}"
 
 
 @dataclass(frozen=True)
@@ -381,15 +381,14 @@ class Comparison:
     def plan_trial(self, scene: Scene, spec: Mapping[str, Any]) -> Plan:
         """Plan a trial with its task (`scene`), `method`, `seed` and other settings."""
         steps = self.tasks[spec["scene"]].steps
-        how: dict[str, Any] = {
-            **LIMITS,
-            **{key: spec[key] for key in ("max_evaluations", "planner") if key in spec},
-            "seed": spec["seed"],
-        }
-        if spec["method"] == "VKC":
-            return plan(scene, steps, **how)
+        settings: dict[str, Any] = {**LIMITS, "seed": spec["seed"]}
+        for key in ("max_evaluations", "planner"):
+            if key in spec:
+                settings[key] = spec[key]
+        if spec["method"] == _OWN:
+            return plan(scene, steps, **settings)
         method, finer = WAYPOINTS.get(spec["method"], (spec["method"], FINER))
-        return plan_separately(scene, steps, method=method, finer=finer, **how)
+        return plan_separately(scene, steps, method=method, finer=finer, **settings)
 
     def specify(
         self,
@@ -405,29 +404,34 @@ class Comparison:
         Starts and poses of objects depend on seed and task alone. Start i is planned with the
         random seed `seed` + i.
         """
-        specs = []
+        specs: list[dict[str, Any]] = []
         for name in tasks:
-            task = self.tasks[name]
-            rng = np.random.default_rng([seed, list(self.tasks).index(name)])
-            scene = _load_scene_once(self.load, task.scene)
-            starts: list[dict[str, Any]] = []
-            for _ in range(trials):
-                more = {"placed": task.scatter(scene, rng)} if task.scatter else {}
-                base = place_objects(scene, more).sample_start(rng).start[:3].tolist()
-                starts.append({"base": base, **more})
-            for method in methods:
-                for number, start in enumerate(starts):
-                    own = {"scene": name, "method": method, "number": number, **start}
-                    key = f"{name}/{number:04d}/{method}"
-                    specs.append(
-                        {
-                            "key": key,
-                            **own,
-                            "seed": seed + number,
-                            "max_evaluations": max_evaluations,
-                        }
-                    )
+            starts = self._sample_starts(name, trials, seed)
+            for method, (number, start) in product(methods, enumerate(starts)):
+                specs.append(
+                    {
+                        "key": f"{name}/{number:04d}/{method}",
+                        "scene": name,
+                        "method": method,
+                        "number": number,
+                        **start,
+                        "seed": seed + number,
+                        "max_evaluations": max_evaluations,
+                    }
+                )
         return specs
+
+    def _sample_starts(self, name: str, trials: int, seed: int) -> list[dict[str, Any]]:
+        """Return random poses of the base for a task, and of objects if these are scattered."""
+        task = self.tasks[name]
+        rng = np.random.default_rng([seed, list(self.tasks).index(name)])
+        scene = _load_scene_once(self.load, task.scene)
+        starts: list[dict[str, Any]] = []
+        for _ in range(trials):
+            placed = {"placed": task.scatter(scene, rng)} if task.scatter else {}
+            start = place_objects(scene, placed).sample_start(rng)
+            starts.append({"base": start.start[:3].tolist(), **placed})
+        return starts
 
     def run(
         self,
@@ -461,7 +465,7 @@ class Comparison:
         tasks = runner.select_names("task", self.tasks if tasks is None else tasks, self.tasks)
         methods = runner.select_names("method", methods, METHODS)
         runner.check_positive(trials=trials)
-        out, progress = Path(out), execution.get("progress", True)
+        out = Path(out)
         specs = self.specify(
             trials=trials, seed=seed, tasks=tasks, methods=methods, max_evaluations=max_evaluations
         )
@@ -473,17 +477,19 @@ class Comparison:
             "methods": methods,
             "scenes": {name: self.tasks[name].scene for name in tasks},
             "goals": {name: list_goals(self.tasks[name].steps) for name in tasks},
-            **{**LIMITS, "max_evaluations": max_evaluations, "retries": RETRIES},
+            **LIMITS,
+            "retries": RETRIES,
         }
-        trials_of = _Trials(self, out, solve or self.plan_trial, timed=solve is None)
-        record = functools.partial(trials_of.record, save_failures=save_failures)
+        settings["max_evaluations"] = max_evaluations
+        folder = _Trials(self, out, solve or self.plan_trial, timed=solve is None)
+        record = functools.partial(folder.record, save_failures=save_failures)
         result = runner.run(specs, record, out, settings=settings, **execution)
-        saved = trials_of.list_saved_plans(
-            result["trials"], specs, again=save_failures, show=progress
-        )
+        records = result["trials"]
+        show = execution.get("progress", True)
+        saved = folder.list_saved_plans(records, specs, again=save_failures, show=show)
         names = {name: self.tasks[name].name for name in tasks}
-        pictures = self.draw(result["trials"], out, names, methods)
-        pictures += trials_of.draw_motions(result["trials"], specs)
+        pictures = self.draw(records, out, names, methods)
+        pictures += folder.draw_motions(records, specs)
         text = self.format_results(result, saved=saved, pictures=pictures)
         write_atomically(out / "table.md", text.encode())
         return result
@@ -509,15 +515,16 @@ def place_objects(scene: Scene, spec: Mapping[str, Any]) -> Scene:
 
 def list_goals(steps: Sequence[Step]) -> dict[str, Any]:
     """Return the goals of steps: "<object>.<joint>" → value, object or "base" → pose."""
-    found: dict[str, Any] = {}
+    goals: dict[str, Any] = {}
     for step in steps:
         if isinstance(step, Actuate):
-            found |= {f"{step.object}.{joint}": value for joint, value in step.joints.items()}
+            for joint, value in step.joints.items():
+                goals[f"{step.object}.{joint}"] = value
         elif isinstance(step, Place):
-            found[step.object] = np.asarray(step.pose, float).tolist()
+            goals[step.object] = np.asarray(step.pose, float).tolist()
         elif isinstance(step, GoTo):
-            found["base"] = [step.x, step.y] if step.yaw is None else [step.x, step.y, step.yaw]
-    return found
+            goals["base"] = [step.x, step.y] if step.yaw is None else [step.x, step.y, step.yaw]
+    return goals
 
 
 @dataclass(frozen=True)
@@ -531,15 +538,17 @@ class _Trials:
 
     def record(self, spec: dict[str, Any], *, save_failures: bool) -> dict[str, Any]:
         """Run a trial and return its record."""
-        if spec["method"] != "VKC":
+        if spec["method"] != _OWN:
             import_solvers()  # before time is measured
-
         found, times = self._plan_timed(spec)
         if save_failures and not found.success and found.status != "interrupted":
-            found.save(self._file(spec, "failures"))
-        own = {"duration": found.metrics["duration"], **compute_peaks(found.trajectory), **times}
-        own |= {key: spec[key] for key in ("scene", "number", "placed") if key in spec}
-        return trial(found, method=spec["method"], seed=spec["seed"], **own)
+            found.save(self._locate_file(spec, "failures"))
+        peaks = compute_peaks(found.trajectory)
+        fields: dict[str, Any] = {"duration": found.metrics["duration"], **peaks, **times}
+        for key in ("scene", "number", "placed"):
+            if key in spec:
+                fields[key] = spec[key]
+        return trial(found, method=spec["method"], seed=spec["seed"], **fields)
 
     def list_saved_plans(
         self,
@@ -550,33 +559,32 @@ class _Trials:
         show: bool,
     ) -> dict[str, str]:
         """Return key → file of saved failures; with `again`, plan those that are not saved."""
-        failed = {r["key"] for r in records if not r["success"] and r["status"] != "error"}
+        failures = [record for record in records if not record["success"]]
+        failed = {record["key"] for record in failures if record["status"] != "error"}
         specs = [spec for spec in specs if spec["key"] in failed]
-        files = {spec["key"]: self._file(spec, "failures") for spec in specs}
-        lost = [spec for spec in specs if again and not files[spec["key"]].is_file()]
+        files = {spec["key"]: self._locate_file(spec, "failures") for spec in specs}
+        lost: list[Mapping[str, Any]] = []
+        if again:
+            lost = [spec for spec in specs if not files[spec["key"]].is_file()]
         for spec in tqdm(lost, desc="failures", unit="plan", disable=not (show and lost)):
             found = self._plan_uninterrupted(spec)
             if not found.success:
                 found.save(files[spec["key"]])
-        return {
-            key: path.relative_to(self.out).as_posix()
-            for key, path in files.items()
-            if path.is_file()
-        }
+        saved = {key: path for key, path in files.items() if path.is_file()}
+        return {key: path.relative_to(self.out).as_posix() for key, path in saved.items()}
 
     def draw_motions(
         self, records: Sequence[Record], specs: Sequence[Mapping[str, Any]]
     ) -> list[str]:
         """Draw the motions of one trial of each task that any method solves."""
-        methods, pictures = tuple(dict.fromkeys(spec["method"] for spec in specs)), []
+        methods = tuple(dict.fromkeys(spec["method"] for spec in specs))
+        pictures: list[str] = []
         for task in dict.fromkeys(spec["scene"] for spec in specs):
             name = self.experiment.tasks[task].name
-            number = choose_shown_trial(
-                [record for record in records if record["scene"] == task], methods
-            )
+            number = choose_shown_trial(select(records, scene=task), methods)
             if number is None:
                 continue
-            chosen = [s for s in specs if (s["scene"], s["number"]) == (task, number)]
+            chosen = select(specs, scene=task, number=number)
             plans = {spec["method"]: self._plan_shown(spec) for spec in chosen}
             title = f"{name.capitalize()}, trial {number}"
             motions_chart(plans, self.out / f"{task}_joints.png", title=title)
@@ -585,7 +593,7 @@ class _Trials:
 
     def _plan_shown(self, spec: Mapping[str, Any]) -> Plan:
         """Load the plan of a trial from the folder, or plan it again and save it there."""
-        path = self._file(spec, "shown")
+        path = self._locate_file(spec, "shown")
         if path.is_file():
             return Plan.load(path)
         found = self._plan_uninterrupted(spec)
@@ -593,7 +601,9 @@ class _Trials:
         return found
 
     def _plan_uninterrupted(self, spec: Mapping[str, Any]) -> Plan:
-        if (found := self._plan(spec)).status == "interrupted":
+        """Plan a trial; an interruption ends the experiment."""
+        found = self._plan(spec)
+        if found.status == "interrupted":
             raise KeyboardInterrupt("all trials are done, but not all of their plans are saved")
         return found
 
@@ -601,20 +611,30 @@ class _Trials:
         """Return a plan and wall times; the first trials are planned cold, then warm."""
         if not self.timed:
             return self._plan(spec), {}
-        times, new = dict[str, float](), {"planner": Planner()} if spec["number"] < COLD else {}
-        for name in ("cold_time", "warm_time") if new else ("wall_time",):
-            began, found = time.perf_counter(), self._plan({**spec, **new})
-            times[name] = time.perf_counter() - began
-            if found.status == "interrupted":
-                break
-        return found, {"wall_time": times.get("warm_time", 0.0), **times}
+        if spec["number"] >= COLD:
+            found, wall_time = self._measure_call(spec)
+            return found, {"wall_time": wall_time}
+        own_planner = {**spec, "planner": Planner()}
+        found, cold_time = self._measure_call(own_planner)
+        if found.status == "interrupted":
+            return found, {"wall_time": 0.0, "cold_time": cold_time}
+        found, warm_time = self._measure_call(own_planner)
+        return found, {"wall_time": warm_time, "cold_time": cold_time, "warm_time": warm_time}
+
+    def _measure_call(self, spec: Mapping[str, Any]) -> tuple[Plan, float]:
+        """Return a plan and the wall time of the call [s]."""
+        began = time.perf_counter()
+        found = self._plan(spec)
+        return found, time.perf_counter() - began
 
     def _plan(self, spec: Mapping[str, Any]) -> Plan:
+        """Plan a trial from its start."""
         name = self.experiment.tasks[spec["scene"]].scene
         scene = place_objects(_load_scene_once(self.experiment.load, name), spec)
         return self.solve(scene.with_start(base=spec["base"]), spec)
 
-    def _file(self, spec: Mapping[str, Any], folder: str) -> Path:
+    def _locate_file(self, spec: Mapping[str, Any], folder: str) -> Path:
+        """Return the file of a trial's plan."""
         return self.out / folder / f"{spec['scene']}_{spec['number']:04d}_{spec['method']}.npz"
 
 
@@ -625,12 +645,13 @@ def _load_scene_once(load: Callable[[str], Scene], name: str) -> Scene:
 
 def choose_shown_trial(records: Sequence[Record], methods: Sequence[str]) -> int | None:
     """Return the trial with most successes, if possible one of VKC; None without any success."""
-    good: dict[int, set[str]] = {}
+    successful: dict[int, set[str]] = {}  # methods by trial
     for record in records:
         if record["success"]:
-            good.setdefault(int(record["number"]), set()).add(str(record["method"]))
-    return max(
-        sorted(good),
-        key=lambda k: (len(good[k]) == len(methods), "VKC" in good[k], len(good[k])),
-        default=None,
-    )
+            successful.setdefault(int(record["number"]), set()).add(str(record["method"]))
+
+    def rank(number: int) -> tuple[bool, bool, int]:
+        own = successful[number]
+        return len(own) == len(methods), _OWN in own, len(own)
+
+    return max(sorted(successful), key=rank, default=None)

@@ -6,6 +6,7 @@ a plan that only grasps the turned lever ("push blind").
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ import pinocchio as pin
 from tqdm import tqdm
 
 from vkc_pin.experiments.harness.record import (
+    Record,
     describe_environment,
     distribution,
     trial,
@@ -26,7 +28,8 @@ from vkc_pin.world.task.steps import Actuate, Grasp, Reach
 
 TASKS = ("reach", "whole", "push", "push blind")
 GOAL = {"hinge": 1.2}
-TURNED = 0.55  # [rad] of the knob where the grasp is given
+# [rad] of the knob where the grasp is given
+TURNED = 0.55
 
 
 def reach(scene: Scene, seed: int) -> Plan:
@@ -69,53 +72,71 @@ def run(*, trials: int, seed: int, progress: bool = True) -> dict[str, Any]:
     rng = np.random.default_rng(seed)
     scene = load_scene("door")
     starts = [scene.sample_start(rng) for _ in range(trials)]
-    records = []
+    records: list[dict[str, Any]] = []
     for number, start in enumerate(tqdm(starts, desc="door", unit="start", disable=not progress)):
-
-        def record(task: str, result: Plan, number: int = number) -> Plan:
+        for task, result in _plan_tasks(start, seed):
             if result.status == "interrupted":
                 raise KeyboardInterrupt
             records.append(trial(result, method="VKC", seed=seed, task=task, number=number))
-            return result
+    about = describe_environment(
+        benchmark="door", seed=seed, trials=trials, peak_memory_mb=measure_peak_memory()
+    )
+    return {"meta": about, "trials": records}
 
-        record("reach", reach(start, seed))
-        whole_plan = record("whole", whole(start, seed))
-        # Where there is no grasp to push from, that plan's failure is the trial's.
-        record("push", push(start, seed, whole_plan) if whole_plan.success else whole_plan)
-        grasp = plan(start.with_state("door", {"knob": TURNED}), [Grasp("door")], seed=seed)
-        record("push blind", push(start, seed, grasp) if grasp.success else grasp)
-    return {
-        "meta": describe_environment(
-            benchmark="door", seed=seed, trials=trials, peak_memory_mb=measure_peak_memory()
-        ),
-        "trials": records,
-    }
+
+def _plan_tasks(start: Scene, seed: int) -> Iterator[tuple[str, Plan]]:
+    """Yield every task and its plan from a start."""
+    yield "reach", reach(start, seed)
+    whole_plan = whole(start, seed)
+    yield "whole", whole_plan
+    # Where there is no grasp to push from, that plan's failure is the trial's.
+    yield "push", push(start, seed, whole_plan) if whole_plan.success else whole_plan
+    turned = start.with_state("door", {"knob": TURNED})
+    grasp = plan(turned, [Grasp("door")], seed=seed)
+    yield "push blind", push(start, seed, grasp) if grasp.success else grasp
 
 
 def table(result: dict[str, Any]) -> str:
     """Return success rates, times and path lengths as text, and every failure."""
-    parts = {"initialization": "guesses", "coal": "coal", "casadi": "CasADi", "ipopt": "Ipopt"}
-    parts["validation"] = "check"
-    names = "".join(f"{name:>8}" for name in ("p95", *parts.values()))
+    names = "".join(f"{name:>8}" for name in ("p95", *_TIMES.values()))
     head = f"{'task':12}{'success':>10}{'time [s] median':>18}{names}"
     lines = [f"{head}{'iter.':>7}{'base [m]':>10}{'arm [rad]':>11}{'build [s]':>11}"]
     for task in TASKS:
-        rows = [t for t in result["trials"] if t["task"] == task]
-        if not rows:
-            continue
-        time, late = distribution(rows, "planning_time")
-        seconds = (late, *(distribution(rows, f"time_{part}")[0] for part in parts))
-        iterations, base, arm = (
-            distribution(rows, field)[0]
-            for field in ("iterations", "base_path_length", "arm_path_length")
-        )
-        success = f"{sum(t['success'] for t in rows)}/{len(rows)}"
-        line = f"{task:12}{success:>10}{time:>18.3f}" + "".join(f"{s:>8.3f}" for s in seconds)
-        build = max(t["build_time"] for t in rows)
-        lines.append(f"{line}{iterations:>7.0f}{base:>10.2f}{arm:>11.2f}{build:>11.2f}")
+        records = [record for record in result["trials"] if record["task"] == task]
+        if records:
+            lines.append(_format_row(task, records))
     lines.append(f"peak memory {result['meta']['peak_memory_mb']:.0f} MB")
-    for t in result["trials"]:
-        if not t["success"]:
-            reason = "; ".join(t["violations"]) or "no violation"
-            lines.append(f"start {t['number']}, {t['task']}: {t['status']}; {reason}")
+    for record in result["trials"]:
+        if not record["success"]:
+            reason = "; ".join(record["violations"]) or "no violation"
+            where = f"start {record['number']}, {record['task']}"
+            lines.append(f"{where}: {record['status']}; {reason}")
     return "\n".join(lines)
+
+
+# Parts of planning time: field → name.
+_TIMES = {
+    "time_initialization": "guesses",
+    "time_coal": "coal",
+    "time_casadi": "CasADi",
+    "time_ipopt": "Ipopt",
+    "time_validation": "check",
+}
+
+
+def _format_row(task: str, records: Sequence[Record]) -> str:
+    """Return the row of a task in the table."""
+    success = f"{sum(record['success'] for record in records)}/{len(records)}"
+    median, late = distribution(records, "planning_time")
+    seconds = [late]
+    for field in _TIMES:
+        seconds.append(distribution(records, field)[0])
+    times = "".join(f"{value:>8.3f}" for value in seconds)
+    iterations, _ = distribution(records, "iterations")
+    base, _ = distribution(records, "base_path_length")
+    arm, _ = distribution(records, "arm_path_length")
+    build = max(record["build_time"] for record in records)
+    return (
+        f"{task:12}{success:>10}{median:>18.3f}{times}"
+        f"{iterations:>7.0f}{base:>10.2f}{arm:>11.2f}{build:>11.2f}"
+    )

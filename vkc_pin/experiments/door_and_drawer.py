@@ -30,11 +30,14 @@ def _draw(
     for task, name in tasks.items():
         own = [record for record in records if record["scene"] == task]
         starts = len({record["number"] for record in own})
-        title = f"{name.capitalize()}, {starts} random start{'s' * (starts != 1)}"
+        noun = "random start" if starts == 1 else "random starts"
+        title = f"{name.capitalize()}, {starts} {noun}"
         criteria_chart(own, out / f"{task}.png", compared, title=title)
     return [f"![Criteria: {name}]({task}.png)" for task, name in tasks.items()]
 
 
 COMPARISON = Comparison("baselines", "Base and arm together, or one after the other", TASKS, _draw)
 
-plan_trial, format_results, run = COMPARISON.plan_trial, COMPARISON.format_results, COMPARISON.run
+plan_trial = COMPARISON.plan_trial
+format_results = COMPARISON.format_results
+run = COMPARISON.run

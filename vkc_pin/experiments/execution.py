@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -42,8 +43,10 @@ from vkc_pin.world.task.steps import Actuate, Grasp, Place, Reach
 
 DEGREES_PER_MM = 0.4
 """Rotation of a displaced hand per displacement [°/mm]."""
-_DRAWS = 20  # directions that are tried
-_TOLERANCE = 1e-8  # [m], [rad] of inverse kinematics
+# directions that are tried
+_DRAWS = 20
+# [m], [rad] of inverse kinematics
+_TOLERANCE = 1e-8
 TASKS: Mapping[str, str] = {
     "door": "push a door with a latched lever",
     "corridor_door": "the same in a corridor",
@@ -106,11 +109,13 @@ def displace_hand(scene: Scene, distance: float, rng: np.random.Generator) -> Sc
     Raises:
         InputError: The robot cannot reach there.
     """
-    (hold,), tool = scene.holds, scene.tool_placement()
+    (hold,) = scene.holds
+    tool = scene.tool_placement()
     for _ in range(_DRAWS):
-        shift, turn = (draw / np.linalg.norm(draw) for draw in rng.normal(size=(2, 3)))
-        turn *= np.radians(DEGREES_PER_MM * distance)
-        row = _reach(scene.with_held({}), tool * pin.SE3(pin.exp3(turn), 1e-3 * distance * shift))
+        direction, axis = (draw / np.linalg.norm(draw) for draw in rng.normal(size=(2, 3)))
+        rotation = pin.exp3(axis * np.radians(DEGREES_PER_MM * distance))
+        displaced = tool * pin.SE3(rotation, 1e-3 * distance * direction)
+        row = _reach(scene.with_held({}), displaced)
         if row is not None:
             return scene.with_measured_grasp(hold.object, base=row[:3], arm=row[3:])
     raise InputError("the robot cannot hold the object elsewhere", got=f"{distance:g} mm off")
@@ -169,8 +174,9 @@ def run(
         "tasks": names,
         "mujoco": version("mujoco"),
         **LIMITS,
+        "physics": vars(Physics()),
+        "grasp": check_choice(grasp, GRASPS, "grasp"),
     }
-    settings |= {"physics": vars(Physics()), "grasp": check_choice(grasp, GRASPS, "grasp")}
     largest = 1e3 * MAX_POSITION_DEVIATION
     given: tuple[Any, ...] = check_list(off, "off", "distances [mm]")
     distances = [
@@ -181,23 +187,19 @@ def run(
         for name in names:
             check_choice(name, graspable, "task that moves a single object", "tasks")
         settings["off"] = distances
-    specs: list[dict[str, Any]] = [
-        {
+    specs: list[dict[str, Any]] = []
+    for name, number in itertools.product(names, range(trials)):
+        spec = {
             "key": f"{list(TASKS).index(name):02d}/{number:04d}",
             "task": name,
             "number": number,
             "seed": seed,
             "grasp": grasp,
         }
-        for name in names
-        for number in range(trials)
-    ]
-    if distances:
-        specs = [
-            {**spec, "key": f"{spec['key']}/{mm:g}", "off": mm}
-            for spec in specs
-            for mm in distances
-        ]
+        if not distances:
+            specs.append(spec)
+        for mm in distances:
+            specs.append({**spec, "key": f"{spec['key']}/{mm:g}", "off": mm})
     return runner.run(
         specs, _record, out, settings=settings, format_results=format_results, **execution
     )
@@ -205,54 +207,76 @@ def run(
 
 def format_results(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown."""
-    about, records = result["meta"], result["trials"]
-    rows = [
-        _row(f"{name}, {mm:g} mm off", select(records, task=name, off=mm))
-        for name in about["tasks"]
-        for mm in about.get("off", ())
-    ]
-    rows = rows or [_row(name, select(records, task=name)) for name in about["tasks"]]
-    rows += [_row("all", records)] if len(rows) > 1 else []
-    problems = Counter(
-        f"{r.get('task')}: {text}" for r in records for text in r.get("problems", ())
-    )
-    lines = [f"- {text}" + f" ({n} times)" * (n > 1) for text, n in problems.items()]
-    table, sections = format_table(_HEAD, rows), list[str]()
+    about = result["meta"]
+    records = result["trials"]
+    sections = [_tabulate_tasks(result)]
     if about.get("off"):
         about_off = (
             "The grasp is executed first. The rest is planned from there, as measured and with the "
             f"hand displaced, and turned by {DEGREES_PER_MM:g}° per mm, in random directions."
         )
-        sections = [about_off, table, _list_trials(records)]
+        sections = [about_off, *sections, _list_trials(records)]
+    title = "# Plans in physics"
+    if about.get("grasp") == "friction":
+        title += ", held by friction"
     return join_sections(
         about,
-        "# Plans in physics" + ", held by friction" * (about.get("grasp") == "friction"),
+        title,
         f"{about['starts']} random starts per task, seed {about['seed']}, {describe_limit(about)} "
         "each. "
         "Plans are counted by the independent validation, and executed if they end within 10 mm "
         "and 0.02 rad of the goal, nothing is pulled out of the hand, and no contact is deeper "
         "than planned by more than 1 mm; beside it Wilson's interval of 95 %. Errors of arm and "
         "base, misses of goals, forces, torques and slips are the largest of all trials.",
-        *(sections or [table]),
+        *sections,
         "## What went wrong",
-        "\n".join(lines) or "Nothing.",
+        _list_problems(records),
     )
+
+
+def _tabulate_tasks(result: Mapping[str, Any]) -> str:
+    """Tabulate the trials by task, and by displacement of the hand if there are any."""
+    about = result["meta"]
+    records = result["trials"]
+    distances = about.get("off", ())
+    rows: list[list[str]] = []
+    for name in about["tasks"]:
+        if not distances:
+            rows.append(_make_row(name, select(records, task=name)))
+        for mm in distances:
+            rows.append(_make_row(f"{name}, {mm:g} mm off", select(records, task=name, off=mm)))
+    if len(rows) > 1:
+        rows.append(_make_row("all", records))
+    return format_table(_HEAD, rows)
+
+
+def _list_problems(records: Sequence[Record]) -> str:
+    """Return a list of the different problems of all trials."""
+    problems = Counter[str]()
+    for record in records:
+        for text in record.get("problems", ()):
+            problems[f"{record.get('task')}: {text}"] += 1
+    lines: list[str] = []
+    for text, number in problems.items():
+        lines.append(f"- {text} ({number} times)" if number > 1 else f"- {text}")
+    return "\n".join(lines) or "Nothing."
 
 
 def _list_trials(records: Sequence[Record]) -> str:
     """Return a list of all trials with their starts and random seeds."""
-    lines = [
-        f"- {r['task']}, start {r['number']}, seed {r['seed']}, {r['off']:g} mm off: "
-        f"{r['status']}, {'executed' if r.get('executed') else 'not executed'}"
-        for r in records
-    ]
-    return "\n".join(["## Trials", "", *lines])
+    lines = ["## Trials", ""]
+    for record in records:
+        where = f"{record['task']}, start {record['number']}, seed {record['seed']}"
+        outcome = "executed" if record.get("executed") else "not executed"
+        lines.append(f"- {where}, {record['off']:g} mm off: {record['status']}, {outcome}")
+    return "\n".join(lines)
 
 
-def _row(name: str, records: Sequence[Record]) -> list[str]:
+def _make_row(name: str, records: Sequence[Record]) -> list[str]:
+    """Return the row of a table for some trials."""
     planned = select(records, success=True)
-    good = sum(bool(record.get("executed")) for record in planned)
-    low, high = compute_wilson_interval(good, len(planned))
+    executed = len([record for record in planned if record.get("executed")])
+    low, high = compute_wilson_interval(executed, len(planned))
     interval = f"{100.0 * low:.0f}–{100.0 * high:.0f}" if planned else "–"
     cells = [name, count(records), count(planned, "executed"), interval]
     for field, (factor, digits) in _FIGURES.items():
@@ -262,34 +286,40 @@ def _row(name: str, records: Sequence[Record]) -> list[str]:
 
 
 def _record(spec: dict[str, Any]) -> dict[str, Any]:
-    scene, steps = make_start(spec["task"], spec["seed"], spec["number"]), ALL[spec["task"]].steps
-    more: dict[str, Any] = {"task": spec["task"], "number": spec["number"], "executed": False}
-    start: Scene | None = scene
-    if (mm := spec.get("off")) is not None:
-        more["off"], step = mm, cast("Actuate | Place", steps[0])
-        rng = np.random.default_rng([spec["seed"], spec["number"], round(1e3 * mm)])
-        found, start = grasp_in_physics(scene, step, spec["seed"], spec["grasp"], LIMITS)
-        start = displace_hand(start, mm, rng) if start is not None and mm else start
-    if start is None:  # the grasp failed
-        problems = [f"the grasp: {found.status}"]
-        return trial(found, method="VKC", seed=spec["seed"], **more, problems=problems) | {
-            "success": False
-        }
-    found = plan(start, steps, seed=spec["seed"], **LIMITS)
+    """Plan and execute a trial, and return its record."""
+    seed = spec["seed"]
+    steps = ALL[spec["task"]].steps
+    start = make_start(spec["task"], seed, spec["number"])
+    fields: dict[str, Any] = {"task": spec["task"], "number": spec["number"], "executed": False}
+    distance = spec.get("off")
+    if distance is not None:
+        fields["off"] = distance
+        step = cast("Actuate | Place", steps[0])
+        found, grasped = grasp_in_physics(start, step, seed, spec["grasp"], LIMITS)
+        if grasped is None:
+            problems = [f"the grasp: {found.status}"]
+            record = trial(found, method="VKC", seed=seed, **fields, problems=problems)
+            record["success"] = False
+            return record
+        start = grasped
+        if distance:
+            rng = np.random.default_rng([seed, spec["number"], round(1e3 * distance)])
+            start = displace_hand(grasped, distance, rng)
+    found = plan(start, steps, seed=seed, **LIMITS)
     if found.success:
-        begin = time.perf_counter()
+        began = time.perf_counter()
         executed = simulate(found.scene, found.steps, found.trajectory, grasp=spec["grasp"])
-        more |= {"simulation_time": time.perf_counter() - begin, **_figures(executed)}
-    return trial(found, method="VKC", seed=spec["seed"], duration=found.metrics["duration"], **more)
+        fields["simulation_time"] = time.perf_counter() - began
+        fields.update(_measure_execution(executed))
+    return trial(found, method="VKC", seed=seed, duration=found.metrics["duration"], **fields)
 
 
-def _figures(result: SimulationResult) -> dict[str, Any]:
+def _measure_execution(result: SimulationResult) -> dict[str, Any]:
     """Return the figures of an execution."""
-
-    def miss(unit: str) -> float | None:
-        return max((m.amount for m in result.misses if m.unit == unit), default=None)
-
-    tracking, grips = result.tracking, result.grips
+    tracking = result.tracking
+    grips = result.grips
+    misses_m = [miss.amount for miss in result.misses if miss.unit == "m"]
+    misses_rad = [miss.amount for miss in result.misses if miss.unit == "rad"]
     return {
         "executed": result.ok,
         "problems": result.problems(),
@@ -298,8 +328,8 @@ def _figures(result: SimulationResult) -> dict[str, Any]:
         "base_error": tracking.base[0],
         "base_error_rms": tracking.base[1],
         "heading_error": tracking.heading[0],
-        "miss_m": miss("m"),
-        "miss_rad": miss("rad"),
+        "miss_m": max(misses_m, default=None),
+        "miss_rad": max(misses_rad, default=None),
         "grasp_force": max((grip.force for grip in grips), default=None),
         "grasp_torque": max((grip.torque for grip in grips), default=None),
         "slip": max((grip.slip for grip in grips), default=0.0) or None,

@@ -35,19 +35,22 @@ STEPWISE = "step after step"
 """The method that plans the steps one after the other, initialised as by "auto"."""
 TARGET = (-1.0, 3.897, 0.1)
 """Goal of the stick's tip in the world frame [m], 3 mm before the cube's south face."""
-PERTURBATION = 0.05  # of the seed trajectory, in all repeats but the first
+PERTURBATION = 0.05
+"""Of the initial guess, in all repeats but the first."""
 _NAMES = {"init_1": "no obstacle", "init_2": "two small obstacles", "init_3": "one large obstacle"}
 
 
 def plan_trial(scene: Scene, spec: Mapping[str, Any]) -> Plan:
     """Plan one trial, given by `method`, `perturbation` and `seed`."""
-    how: dict[str, Any] = {
-        "initialization": "auto" if spec["method"] == STEPWISE else spec["method"],
-        "simultaneous": spec["method"] != STEPWISE,
-        "perturbation": spec["perturbation"],
-    }
+    is_stepwise = spec["method"] == STEPWISE
     return plan(
-        scene, [Grasp("stick"), Touch("stick.tip", TARGET)], seed=spec["seed"], **LIMITS, **how
+        scene,
+        [Grasp("stick"), Touch("stick.tip", TARGET)],
+        initialization="auto" if is_stepwise else spec["method"],
+        simultaneous=not is_stepwise,
+        perturbation=spec["perturbation"],
+        seed=spec["seed"],
+        **LIMITS,
     )
 
 
@@ -60,31 +63,29 @@ def specify(
     has an unperturbed initial guess. With "auto", the steps are also planned one after the other,
     once per start.
     """
-    trials = []
+    trials: list[dict[str, Any]] = []
     for scene in scenes:
         number = SCENES.index(scene) + 1 if scene in SCENES else 0
-        rng, loaded = np.random.default_rng([seed, number]), load_scene(scene)
+        rng = np.random.default_rng([seed, number])
+        loaded = load_scene(scene)
         for start in range(starts):
             base = loaded.sample_start(rng).start[:3].tolist()
-            own_seed = int(np.random.default_rng([seed, number, start]).integers(2**31))
+            start_rng = np.random.default_rng([seed, number, start])
+            start_seed = int(start_rng.integers(2**31))
             for repeat in range(repeats):
-                for method in (
-                    *methods,
-                    *([STEPWISE] if "auto" in methods and repeat == 0 else []),
-                ):
-                    key = f"{scene}/{start:04d}/{repeat:03d}/{method}"
-                    spec = {
-                        "key": key,
-                        "scene": scene,
-                        "method": method,
-                        "number": start,
-                        "repeat": repeat,
-                        "base": base,
-                    }
+                compared = list(methods)
+                if "auto" in methods and repeat == 0:
+                    compared.append(STEPWISE)
+                for method in compared:
                     trials.append(
                         {
-                            **spec,
-                            "seed": own_seed + repeat,
+                            "key": f"{scene}/{start:04d}/{repeat:03d}/{method}",
+                            "scene": scene,
+                            "method": method,
+                            "number": start,
+                            "repeat": repeat,
+                            "base": base,
+                            "seed": start_seed + repeat,
                             "perturbation": PERTURBATION if repeat else 0.0,
                         }
                     )
@@ -132,20 +133,26 @@ def run(
         trials, function, out, settings=settings, format_results=format_results, **execution
     )
     title = f"Success by initialization, {starts} starts"
-    title += f", {repeats} trials from each" if repeats > 1 else ""
-    path, labels = Path(out) / "success.png", _label_scenes(scenes)
-    success_chart(result["trials"], path, labels, methods, title=title)
+    if repeats > 1:
+        title += f", {repeats} trials from each"
+    success_chart(
+        result["trials"], Path(out) / "success.png", _label_scenes(scenes), methods, title=title
+    )
     return result
 
 
 def format_results(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown."""
-    about, records = result["meta"], result["trials"]
-    scenes, methods = _label_scenes(about["scenes"]), about["methods"]
-    repeats = f", {about['repeats']} trials from each, all but the first with a perturbed guess"
+    about = result["meta"]
+    records = result["trials"]
+    scenes = _label_scenes(about["scenes"])
+    methods = about["methods"]
+    repeats = ""
+    if about["repeats"] > 1:
+        repeats = f", {about['repeats']} trials from each, all but the first with a perturbed guess"
     parts = [
         "# Initializing the trajectory",
-        f"{about['starts']} random starts per scene{repeats if about['repeats'] > 1 else ''}; "
+        f"{about['starts']} random starts per scene{repeats}; "
         f"seed {about['seed']}, {describe_limit(about)} per trial. {JUDGED} "
         "Planning times are those of all trials, path lengths those of successes (medians).",
         methods_table(records, scenes, [*methods, STEPWISE]),
@@ -162,17 +169,22 @@ def format_results(result: Mapping[str, Any]) -> str:
 
 
 def _record(spec: dict[str, Any], solve: Solve) -> dict[str, Any]:
-    scene = _scene(spec["scene"]).with_start(base=spec["base"])
-    own = {key: spec[key] for key in ("scene", "number", "repeat", "perturbation")}
+    """Plan a trial and return its record."""
+    scene = _load_scene(spec["scene"]).with_start(base=spec["base"])
+    fields = {key: spec[key] for key in ("scene", "number", "repeat", "perturbation")}
     began = time.perf_counter()
     found = solve(scene, spec)
     if solve is plan_trial:
-        own["wall_time"] = time.perf_counter() - began
-    return trial(found, method=spec["method"], seed=spec["seed"], **own)
+        fields["wall_time"] = time.perf_counter() - began
+    return trial(found, method=spec["method"], seed=spec["seed"], **fields)
 
 
-_scene = functools.cache(load_scene)  # once per process
+_load_scene = functools.cache(load_scene)  # once per process
 
 
 def _label_scenes(scenes: Sequence[str]) -> dict[str, str]:
-    return {scene: f"{scene}: {_NAMES[scene]}" if scene in _NAMES else scene for scene in scenes}
+    """Return the displayed name of each scene."""
+    labels: dict[str, str] = {}
+    for scene in scenes:
+        labels[scene] = f"{scene}: {_NAMES[scene]}" if scene in _NAMES else scene
+    return labels

@@ -16,9 +16,12 @@ from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Actuate, Grasp, Step
 
-_SHARES = (0.35, 0.65)  # fraction of a joint's range by which random tasks move it
-_TURN = np.pi  # [rad] range of joints without limits
-_MAX_OBJECTS = 2  # in one room
+# fraction of a joint's range by which random tasks move it
+_SHARES = (0.35, 0.65)
+# [rad] range of joints without limits, to either side
+_TURN = np.pi
+# in one room
+_MAX_OBJECTS = 2
 
 
 def goals(scene: Scene, *, share: float = 0.5) -> tuple[Step, ...]:
@@ -40,12 +43,11 @@ def goals(scene: Scene, *, share: float = 0.5) -> tuple[Step, ...]:
         raise InputError("out of range", field="share", expected="above 0 and at most 1", got=share)
     found: list[Step] = []
     for name, placed in scene.objects.items():
-        if placed.object.free and not placed.object.attachments:
-            continue  # it cannot be grasped
-        if placed.object.free:
-            found.append(Grasp(name, _find_freest(list(placed.object.attachments.values())).name))
-        else:
+        attachments = list(placed.object.attachments.values())
+        if not placed.object.free:
             found += _list_joint_steps(name, placed, share)
+        elif attachments:  # without, it cannot be grasped
+            found.append(Grasp(name, _find_freest(attachments).name))
     return tuple(found)
 
 
@@ -88,7 +90,8 @@ def random_task(
 
 def _list_joint_steps(name: str, placed: PlacedObject, share: float) -> list[Step]:
     """Return the steps that open or close the joints of an object."""
-    item, attachments_of = placed.object, dict[str, list[Attachment]]()
+    item = placed.object
+    attachments_of: dict[str, list[Attachment]] = {}
     for attachment in item.attachments.values():
         joint = _find_first_joint(item, attachment)
         # Pushes move a joint in one direction only.
@@ -98,12 +101,10 @@ def _list_joint_steps(name: str, placed: PlacedObject, share: float) -> list[Ste
     for joint, attachments in attachments_of.items():
         k = item.coordinates.index(joint)
         now = float(placed.state[k])
-        lower, upper = (
-            limit if np.isfinite(limit) else now + offset
-            for limit, offset in zip((item.lower[k], item.upper[k]), (-_TURN, _TURN), strict=True)
-        )
-        by = share * (upper - lower)
-        goal = now + by if now <= (lower + upper) / 2.0 else now - by
+        lower = item.lower[k] if np.isfinite(item.lower[k]) else now - _TURN
+        upper = item.upper[k] if np.isfinite(item.upper[k]) else now + _TURN
+        change = share * (upper - lower)
+        goal = now + change if now <= (lower + upper) / 2.0 else now - change
         value = float(np.clip(round(goal, 3), lower, upper))  # a rounded limit may exceed itself
         steps.append(Actuate(name, {joint: value}, _find_freest(attachments).name))
     return steps

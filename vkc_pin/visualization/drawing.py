@@ -43,15 +43,45 @@ from vkc_pin.world.trajectory.placements import Motion, sample_motion
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
-_START, _END = (0.22, 0.42, 0.78), (0.10, 0.60, 0.38)  # of the ghosts
-_TOOL, _BASE = (0.88, 0.20, 0.35), (0.16, 0.42, 0.72)  # of the paths
-_PATH_STEP = 0.05  # between points of a path [rad], [m]: chords of 1 m radius are 0.3 mm off
+# colours of the ghosts
+_START = (0.22, 0.42, 0.78)
+_END = (0.10, 0.60, 0.38)
+# colours of the paths, and their radii [m]
+_TOOL = (0.88, 0.20, 0.35)
+_BASE = (0.16, 0.42, 0.72)
+_TOOL_RADIUS = 0.008
+_BASE_RADIUS = 0.014
+# [m] height of the base's path, above the floor's grid
+_BASE_HEIGHT = 0.006
+# [rad], [m] between points of a path: chords of 1 m radius are 0.3 mm off
+_PATH_STEP = 0.05
+# colour of colliding links
 _ALARM = (0.90, 0.05, 0.05)
-_ALARM_TIME = 0.4  # duration for which colliding links are red before and after [s]
-_GHOST_DETAIL = 0.007  # [m]
-_AXES = {"x": (0.86, 0.13, 0.13), "y": (0.13, 0.60, 0.16), "z": (0.11, 0.27, 0.90)}  # of frames
-_AXIS_LENGTH, _AXIS_RADIUS = 0.16, 0.007  # [m]
-_BESIDE = "beside"  # path of the second motion in the tree
+# [s] for which they are red before and after
+_ALARM_TIME = 0.4
+# [s] in which their colour changes
+_ALARM_FADE = 0.05
+# [m] of meshes
+_GHOST_DETAIL = 0.007
+# colours of the axes of frames
+_AXES = {"x": (0.86, 0.13, 0.13), "y": (0.13, 0.60, 0.16), "z": (0.11, 0.27, 0.90)}
+# [m]
+_AXIS_LENGTH = 0.16
+_AXIS_RADIUS = 0.007
+# path of the second motion in the tree
+_BESIDE = "beside"
+# what meshcat shows by itself
+_HIDDEN = (
+    "/Grid",
+    "/Axes",
+    "/Lights/PointLightNegativeX",
+    "/Lights/PointLightPositiveX",
+    "/Lights/FillLight",
+)
+# opacity of objects where they may hide the motion
+_OBJECT_OPACITY = 0.3
+# about the number of points of a part that are used to choose the viewpoint
+_POINTS_PER_PART = 60
 _meshes: weakref.WeakKeyDictionary[Robot, list[Solid]] = weakref.WeakKeyDictionary()
 
 
@@ -92,8 +122,11 @@ class Drawing:
         times: Floats | None = None,
         beside: Motion | None = None,
     ) -> None:
-        self.viewer, self.scene, self.trajectory = viewer, scene, trajectory
-        self.report, self.beside = report, beside
+        self.viewer = viewer
+        self.scene = scene
+        self.trajectory = trajectory
+        self.report = report
+        self.beside = beside
         self.world = World(scene) if world is None else world
         self.motion: Motion = sample_motion(self.world, trajectory, times)
         self.room = Room(scene)
@@ -114,29 +147,17 @@ class Drawing:
         self._set_surroundings()
         for item in self.items:
             opacity = item.colour[3] if len(item.colour) > 3 else 1.0
-            self._draw_part(
-                Part(item.path, item.solid, item.colour, opacity, shadow=opacity >= 1.0)
-            )
+            part = Part(item.path, item.solid, item.colour, opacity, shadow=opacity >= 1.0)
+            self._draw_part(part)
             self.viewer[item.path].set_transform(item.placement.homogeneous)
         for joint in range(1, self.world.model.njoints):
-            self.viewer[self.nodes[joint]].set_transform(self.motion.local[joint][0].homogeneous)
-        for part in self.room.make_parts():
-            self._draw_part(replace(part, name=f"room/{part.name}"))
-        for name, points, grey in self.room.make_lines():
-            thin = g.LineBasicMaterial(color=encode_colour((grey, grey, grey)))
-            self._draw_without_shadow(
-                f"room/{name}", g.LineSegments(g.PointsGeometry(points.astype(np.float32).T), thin)
-            )
+            placement = self.motion.local[joint][0]
+            self.viewer[self.nodes[joint]].set_transform(placement.homogeneous)
+        self._draw_room()
         self._draw_frames(frames or {}, set())
         if self.trajectory is not None:
-            self._draw_paths()
-            moving = np.any(
-                [*self.movers.values(), np.zeros(self.world.model.njoints, bool)], axis=0
-            )
-            self.light = [
-                simplify(item.solid, _GHOST_DETAIL) if moving[item.joint] else None
-                for item in self.items
-            ]
+            self._draw_paths(self.trajectory)
+            self.light = self._make_light_meshes()
             if self.beside is None:
                 self._draw_ghosts("start", 0, _START)
                 self._draw_ghosts("end", -1, _END)
@@ -151,71 +172,101 @@ class Drawing:
 
     def find_viewpoint(self, aspect: float = LANDSCAPE) -> tuple[Floats, Floats]:
         """Choose target and position of the camera so that motion and objects are visible."""
-        motion, high = self.motion, np.array([0.0, 0.0, 1.0])
+        motion = self.motion
+        up = np.array([0.0, 0.0, 1.0])
+        # The base on the floor with 0.6 m around it, 1 m above, and the tool.
         around = np.array([[x, y, 0.0] for x in (-0.6, 0.6) for y in (-0.6, 0.6)])
         points = [
-            (motion.base[:, None] * (1.0 - high) + around).reshape(-1, 3),
-            motion.base + high,
+            (motion.base[:, None] * (1.0 - up) + around).reshape(-1, 3),
+            motion.base + up,
             motion.tool,
         ]
         boxes = self.room.find_obstructions()
+        rows = [0, len(motion.times) // 2, -1]
         for item in self.items:
-            if item.path.startswith("objects"):
-                local = item.solid.transform(item.placement).vertices
-                for placement in motion.world[[0, len(motion.times) // 2, -1], item.joint]:
-                    points.append(local @ placement[:3, :3].T + placement[:3, 3])
-                    boxes.append((points[-1].min(axis=0), points[-1].max(axis=0), 0.3))
-        cloud = np.concatenate([p[:: max(1, len(p) // 60)] for p in points])
-        return choose_viewpoint(cloud, boxes, aspect)
+            if not item.path.startswith("objects"):
+                continue
+            vertices = item.solid.transform(item.placement).vertices
+            for placement in motion.world[rows, item.joint]:
+                placed = vertices @ placement[:3, :3].T + placement[:3, 3]
+                points.append(placed)
+                boxes.append((placed.min(axis=0), placed.max(axis=0), _OBJECT_OPACITY))
+        some = [part[:: max(1, len(part) // _POINTS_PER_PART)] for part in points]
+        return choose_viewpoint(np.concatenate(some), boxes, aspect)
 
     def _find_nodes(self) -> list[str]:
         """Return the path of every joint in the tree."""
-        model, nodes = self.world.model, ["robot"]
+        model = self.world.model
+        nodes = ["robot"]
         for j in range(1, model.njoints):
-            owner, _, rest = str(model.names[j]).partition(".")
-            placed = rest and owner in self.scene.objects
-            root = f"objects/{owner}" if placed else "robot"
+            joint = str(model.names[j])
+            root = "robot"
+            owner, _, rest = joint.partition(".")
+            if rest and owner in self.scene.objects:
+                root = f"objects/{owner}"
+                joint = rest
             above = nodes[model.parents[j]] if model.parents[j] else root
-            nodes.append(add_node(self.taken, above, rest if placed else str(model.names[j])))
+            nodes.append(add_node(self.taken, above, joint))
         return nodes
 
     def _make_robot_items(self) -> list[Item]:
+        """Return the shapes of the robot's links."""
         robot = self.scene.robot
+        sources = robot.visual.geometryObjects
         if robot not in _meshes:
-            _meshes[robot] = [to_solid(shape.geometry) for shape in robot.visual.geometryObjects]
-        items = []
+            _meshes[robot] = [to_solid(shape.geometry) for shape in sources]
+        solids = _meshes[robot]
         # The robot's shapes are the first, on the joints of its fingers, too.
-        placed = list(self.world.visual.geometryObjects)[: len(_meshes[robot])]
-        for source, shape, solid in zip(
-            robot.visual.geometryObjects, placed, _meshes[robot], strict=True
-        ):
+        placed = list(self.world.visual.geometryObjects)[: len(solids)]
+        items: list[Item] = []
+        for source, shape, solid in zip(sources, placed, solids, strict=True):
             link = str(robot.model.frames[source.parentFrame].name)
             path = add_node(self.taken, self.nodes[shape.parentJoint], link, shape.name)
-            colour = tuple(map(float, shape.meshColor))
+            colour = tuple(float(value) for value in shape.meshColor)
             items.append(
                 Item(path, shape.parentJoint, shape.placement, solid, colour=colour, label=link)
             )
         return items
 
     def _make_object_items(self) -> list[Item]:
-        items: list[Item] = []
-        shapes, labels = list(self.world.visual.geometryObjects), self.world.visual_labels
+        """Return the shapes of the objects' links."""
+        shapes = list(self.world.visual.geometryObjects)
+        labels = self.world.visual_labels
         first = len(self.scene.robot.visual.geometryObjects)
         end = len(shapes) - len(self.scene.obstacle_visual)
+        items: list[Item] = []
         for shape, label in zip(shapes[first:end], labels[first:end], strict=True):
+            joint = shape.parentJoint
             owner, _, link = label.partition(".")
-            root = self.nodes[shape.parentJoint] if shape.parentJoint else f"objects/{owner}"
+            root = self.nodes[joint] if joint else f"objects/{owner}"
+            own_name = shape.name.partition(".")[2]
             for k, (solid, colour) in enumerate(load_drawn_parts(shape)):
-                name = shape.name.partition(".")[2] + (f"_{k}" if k else "")
+                name = f"{own_name}_{k}" if k else own_name
                 path = add_node(self.taken, root, link, name)
-                items.append(
-                    Item(
-                        path, shape.parentJoint, shape.placement, solid, colour=colour, label=label
-                    )
-                )
+                items.append(Item(path, joint, shape.placement, solid, colour=colour, label=label))
         return items
 
+    def _make_light_meshes(self) -> list[Solid | None]:
+        """Return coarse meshes of the moving items; None for the others."""
+        is_moving = np.zeros(self.world.model.njoints, bool)
+        for joints in self.movers.values():
+            is_moving |= joints
+        return [
+            simplify(item.solid, _GHOST_DETAIL) if is_moving[item.joint] else None
+            for item in self.items
+        ]
+
+    def _draw_room(self) -> None:
+        """Draw obstacles, floor and edges of walls."""
+        for part in self.room.make_parts():
+            self._draw_part(replace(part, name=f"room/{part.name}"))
+        for name, points, grey in self.room.make_lines():
+            thin = g.LineBasicMaterial(color=encode_colour((grey, grey, grey)))
+            geometry = g.PointsGeometry(points.astype(np.float32).T)
+            self._draw_without_shadow(f"room/{name}", g.LineSegments(geometry, thin))
+
     def _draw_part(self, part: Part) -> None:
+        """Draw a mesh."""
         paint = make_material(part.colour, part.opacity, one_sided=part.one_sided)
         if part.shadow:
             self.viewer[part.name].set_object(Triangles(part.solid), paint)
@@ -235,36 +286,39 @@ class Drawing:
                 solid = make_tube(np.stack([np.zeros(3), _AXIS_LENGTH * end]), _AXIS_RADIUS)
                 assert solid is not None
                 # Only what counts as translucent is drawn after the bodies.
-                seen = g.MeshBasicMaterial(
+                material = g.MeshBasicMaterial(
                     color=encode_colour(colour), transparent=True, depthTest=False
                 )
-                self._draw_without_shadow(f"{where}/{axis}", Triangles(solid), seen)
+                self._draw_without_shadow(f"{where}/{axis}", Triangles(solid), material)
             self.viewer[where].set_transform(placement.homogeneous)
 
-    def _draw_paths(self) -> None:
-        assert self.trajectory is not None
-        motion = sample_motion(self.world, self.trajectory, step=_PATH_STEP)
-        for name, points, radius, colour in (
-            ("tool", motion.tool, 0.008, _TOOL),
-            ("base", motion.base * [1.0, 1.0, 0.0] + [0.0, 0.0, 0.006], 0.014, _BASE),
-        ):
-            solid = make_tube(points, radius)
-            if solid is not None:
-                flat = g.MeshBasicMaterial(color=encode_colour(colour))
-                self._draw_without_shadow(f"paths/{name}", Triangles(solid), flat)
+    def _draw_paths(self, trajectory: Trajectory) -> None:
+        """Draw the paths of tool and base as tubes."""
+        motion = sample_motion(self.world, trajectory, step=_PATH_STEP)
+        on_floor = motion.base * [1.0, 1.0, 0.0] + [0.0, 0.0, _BASE_HEIGHT]
+        self._draw_tube("paths/tool", motion.tool, _TOOL_RADIUS, _TOOL)
+        self._draw_tube("paths/base", on_floor, _BASE_RADIUS, _BASE)
+
+    def _draw_tube(
+        self, path: str, points: Floats, radius: float, colour: tuple[float, float, float]
+    ) -> None:
+        """Draw a tube along points, unless these are all in one place."""
+        solid = make_tube(points, radius)
+        if solid is not None:
+            flat = g.MeshBasicMaterial(color=encode_colour(colour))
+            self._draw_without_shadow(path, Triangles(solid), flat)
 
     def _draw_ghosts(self, name: str, row: int, colour: tuple[float, float, float]) -> None:
         """Draw moving bodies at `row` as ghosts, one each for the robot and every object."""
         for owner, joints in self.movers.items():
-            solids = [
-                light.transform(pin.SE3(self.motion.world[row, item.joint]) * item.placement)
-                for item, light in zip(self.items, self.light, strict=True)
-                if light is not None and joints[item.joint]
-            ]
+            solids: list[Solid] = []
+            for item, light in zip(self.items, self.light, strict=True):
+                if light is not None and joints[item.joint]:
+                    joint = pin.SE3(self.motion.world[row, item.joint])
+                    solids.append(light.transform(joint * item.placement))
             if solids:
-                self.viewer[f"ghosts/{name}/{owner}"].set_object(
-                    Ghost(merge_solids(solids), colour)
-                )
+                ghost = Ghost(merge_solids(solids), colour)
+                self.viewer[f"ghosts/{name}/{owner}"].set_object(ghost)
 
     def _draw_second_motion(self, beside: Motion) -> None:
         """Draw the ghosts of the second motion."""
@@ -279,82 +333,95 @@ class Drawing:
 
     def _find_movers(self) -> dict[str, Bools]:
         """Return the masks of moving joints, shape (joints,), of the robot and of every object."""
-        model, moves = self.world.model, self.motion.moving.copy()
-        owners: dict[str, Bools] = {}
+        model = self.world.model
+        is_moving = self.motion.moving.copy()
+        movers: dict[str, Bools] = {}
         for j in range(1, model.njoints):
-            moves[j] |= moves[model.parents[j]]
-            if moves[j]:
-                owner = (
-                    self.nodes[j].split("/")[1] if self.nodes[j].startswith("objects/") else "robot"
-                )
-                owners.setdefault(owner, np.zeros(model.njoints, bool))[j] = True
-        return owners
+            is_moving[j] |= is_moving[model.parents[j]]
+            if not is_moving[j]:
+                continue
+            owner = "robot"
+            if self.nodes[j].startswith("objects/"):
+                owner = self.nodes[j].split("/")[1]
+            movers.setdefault(owner, np.zeros(model.njoints, bool))[j] = True
+        return movers
 
     def _set_surroundings(self) -> None:
         """Set up camera, lights and background, and hide meshcat's own grid and axes."""
-        (target, position), place = self.find_viewpoint(), self.viewer
+        viewer = self.viewer
+        target, position = self.find_viewpoint()
         # meshcat's camera turns about the origin of its world, so the drawing moves there, not the
         # camera.
-        place.set_transform(pin.SE3(np.eye(3), -target).homogeneous)
-        lens = place["/Cameras/default/rotated/<object>"]
+        viewer.set_transform(pin.SE3(np.eye(3), -target).homogeneous)
+        lens = viewer["/Cameras/default/rotated/<object>"]
         lens.set_property("fov", FIELD_OF_VIEW)
         lens.set_property("position", _convert_to_meshcat(position - target))
-        lights = ("PointLightNegativeX", "PointLightPositiveX", "FillLight")
-        for name in ("/Grid", "/Axes", *(f"/Lights/{light}" for light in lights)):
-            place[name].set_property("visible", False)
-        place["/Lights/AmbientLight/<object>"].set_property("intensity", 0.62)
-        place["/Lights/Sun"].set_object(
-            Sun(self.room.centre - target, self.room.reach, position - target)
-        )
-        place["/Background"].set_property("top_color", [0.93, 0.95, 0.97])
-        place["/Background"].set_property("bottom_color", [0.99, 0.99, 0.99])
+        for name in _HIDDEN:
+            viewer[name].set_property("visible", False)
+        viewer["/Lights/AmbientLight/<object>"].set_property("intensity", 0.62)
+        sun = Sun(self.room.centre - target, self.room.reach, position - target)
+        viewer["/Lights/Sun"].set_object(sun)
+        viewer["/Background"].set_property("top_color", [0.93, 0.95, 0.97])
+        viewer["/Background"].set_property("bottom_color", [0.99, 0.99, 0.99])
 
     def _make_animation(self) -> Animation:
         """Make the animation, with key frames in seconds, since the frame rate is 1."""
         movie = Animation(default_framerate=1)
         if self.trajectory is None:
             return movie
+        self._animate_joints(movie, self.motion, "")
+        if self.beside is None:
+            self._animate_ghosts(movie, "start", 0)
+            self._animate_ghosts(movie, "end", -1)
+        else:
+            self._animate_joints(movie, self.beside, f"{_BESIDE}/")
+        self._animate_collisions(movie)
+        return movie
+
+    def _animate_joints(self, movie: Animation, motion: Motion, above: str) -> None:
+        """Animate the moving joints, whose nodes are below `above`."""
         times = (self.motion.times - self.motion.times[0]).tolist()
-        for motion, above in (
-            (self.motion, ""),
-            *([] if self.beside is None else [(self.beside, f"{_BESIDE}/")]),
-        ):
-            for j in np.flatnonzero(motion.moving):
-                local = motion.local[j]
-                quaternions = [
-                    pin.Quaternion(placement.rotation).coeffs().tolist() for placement in local
-                ]
-                tracks = [Track("quaternion", "quaternion", times, quaternions)]
-                positions = [placement.translation.tolist() for placement in local]
-                if np.ptp(positions, axis=0).max() > 1e-9:
-                    tracks.append(Track("position", "vector3", times, positions))
-                self._add_clip(movie, above + self.nodes[j], tracks)
-        for name, row in (("start", 0), ("end", -1)) if self.beside is None else ():
-            for owner, joints in self.movers.items():
-                away = self.motion.away(joints, row).tolist()
-                self._add_clip(
-                    movie, f"ghosts/{name}/{owner}", [Track("visible", "bool", times, away)]
-                )
-        found = self.report.violations if self.report is not None else ()
-        collisions = [v for v in found if v.constraint in ("clearance", "penetration")]
+        for j in np.flatnonzero(motion.moving):
+            local = motion.local[j]
+            rotations = [pin.Quaternion(placement.rotation) for placement in local]
+            quaternions = [rotation.coeffs().tolist() for rotation in rotations]
+            tracks = [Track("quaternion", "quaternion", times, quaternions)]
+            positions = [placement.translation.tolist() for placement in local]
+            if np.ptp(positions, axis=0).max() > 1e-9:
+                tracks.append(Track("position", "vector3", times, positions))
+            self._add_clip(movie, above + self.nodes[j], tracks)
+
+    def _animate_ghosts(self, movie: Animation, name: str, row: int) -> None:
+        """Show the ghosts of a row while the bodies are elsewhere."""
+        times = (self.motion.times - self.motion.times[0]).tolist()
+        for owner, joints in self.movers.items():
+            away = self.motion.away(joints, row).tolist()
+            track = Track("visible", "bool", times, away)
+            self._add_clip(movie, f"ghosts/{name}/{owner}", [track])
+
+    def _animate_collisions(self, movie: Animation) -> None:
+        """Colour links in collision red."""
+        violations = self.report.violations if self.report is not None else ()
+        collisions = [v for v in violations if v.constraint in ("clearance", "penetration")]
         for item in self.items:
             moments = [v.time for v in collisions if item.label in v.subject.split(" – ")]
             if moments:
                 self._add_clip(movie, f"{item.path}/<object>", [self._make_alarm(item, moments)])
-        return movie
 
     def _make_alarm(self, item: Item, moments: list[float]) -> Track:
         """Make a track that colours an item red around `moments` [s]."""
-        first, last = self.motion.times[0], self.motion.times[-1]
-        edges = (
-            moment + d
-            for moment in moments
-            for a in (_ALARM_TIME, _ALARM_TIME - 0.05)
-            for d in (-a, a)
-        )
-        times = sorted({first, last, *(t for t in edges if first < t < last)})
-        red = [any(abs(t - moment) < _ALARM_TIME - 0.02 for moment in moments) for t in times]
-        colours = [[float(c) for c in (_ALARM if alarm else item.colour[:3])] for alarm in red]
+        first = self.motion.times[0]
+        last = self.motion.times[-1]
+        edges = {first, last}
+        for moment in moments:
+            for distance in (_ALARM_TIME, _ALARM_TIME - _ALARM_FADE):
+                edges.update((moment - distance, moment + distance))
+        times = sorted(time for time in edges if first <= time <= last)
+        colours: list[list[float]] = []
+        for time in times:
+            is_red = any(abs(time - moment) < _ALARM_TIME - 0.02 for moment in moments)
+            colour = _ALARM if is_red else item.colour[:3]
+            colours.append([float(value) for value in colour])
         return Track("material.color", "color", [float(t - first) for t in times], colours)
 
     def _add_clip(self, movie: Animation, path: str, tracks: list[Track]) -> None:

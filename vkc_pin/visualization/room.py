@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 
@@ -18,10 +19,17 @@ from vkc_pin.world.scene.scene import Scene
 # An upright box at most this thick that reaches at least this high is a wall [m].
 _THIN = 0.25
 _HIGH = 2.0
-_BEYOND = 0.35  # a wall with more of the arena behind it is a partition [m]
-_VEIL, _DIVIDER = 0.07, 0.32  # opacities
+# [m] A wall with more of the arena behind it is a partition.
+_BEYOND = 0.35
+# opacities of a wall's outside, and of partitions
+_OUTSIDE = 0.07
+_DIVIDER = 0.32
 _FLOOR_COLOUR = (0.90, 0.89, 0.87)
-_DETAIL = 1e-3  # [m] of meshes
+# [m] between lines of the floor's grid, and their height above it
+_GRID_STEP = 0.5
+_GRID_HEIGHT = 0.002
+# [m] of meshes
+_DETAIL = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,11 +66,14 @@ class Room:
         self._walls: list[pin.GeometryObject] = []
         self._furniture: list[pin.GeometryObject] = []
         for shape in scene.obstacle_visual:
-            (self._walls if is_wall(shape) else self._furniture).append(shape)
+            if is_wall(shape):
+                self._walls.append(shape)
+            else:
+                self._furniture.append(shape)
 
     def make_parts(self) -> list[Part]:
         """Return the meshes to draw."""
-        parts = []
+        parts: list[Part] = []
         if self.scene.floor:
             x_min, x_max, y_min, y_max = self.scene.arena
             floor = make_box(np.array([x_min, y_min, -0.03]), np.array([x_max, y_max, 0.0]))
@@ -72,48 +83,45 @@ class Room:
             for k, (solid, colour) in enumerate(drawn):
                 name = f"{shape.name}/{k}" if len(drawn) > 1 else str(shape.name)
                 opacity = colour[3] if len(colour) > 3 else 1.0
-                parts.append(
-                    Part(
-                        name,
-                        solid.transform(shape.placement),
-                        colour,
-                        opacity,
-                        shadow=opacity >= 1.0,
-                    )
-                )
+                placed = solid.transform(shape.placement)
+                parts.append(Part(name, placed, colour, opacity, shadow=opacity >= 1.0))
         for shape in self._walls:
             parts += self._make_wall_parts(shape)
         return parts
 
     def make_lines(self) -> list[tuple[str, Floats, float]]:
         """Return name, segments, shape (2·k, 3) [m], and brightness of grid and wall edges."""
-        drawn = []
+        lines: list[tuple[str, Floats, float]] = []
         if self.scene.floor:
-            x_min, x_max, y_min, y_max = self.scene.arena
-            xs, ys = (
-                np.arange(np.ceil(low / 0.5) * 0.5, high, 0.5)
-                for low, high in ((x_min, x_max), (y_min, y_max))
-            )
-            ends = [[(x, y_min), (x, y_max)] for x in xs] + [[(x_min, y), (x_max, y)] for y in ys]
-            flat = np.array(ends, float).reshape(-1, 2)
-            drawn.append(("grid", np.column_stack([flat, np.full(len(flat), 0.002)]), 0.78))
-        edges = [
-            shape.placement.act(corner) for shape in self._walls for corner in _find_edges(shape)
-        ]
+            lines.append(("grid", self._make_grid(), 0.78))
+        edges: list[Floats] = []
+        for shape in self._walls:
+            edges += [shape.placement.act(corner) for corner in _find_edges(shape)]
         if edges:
-            drawn.append(("wall_edges", np.array(edges), 0.55))
-        return drawn
+            lines.append(("wall_edges", np.array(edges), 0.55))
+        return lines
+
+    def _make_grid(self) -> Floats:
+        """Return the segments of the floor's grid, shape (2·k, 3) [m]."""
+        x_min, x_max, y_min, y_max = self.scene.arena
+        ends: list[tuple[float, float]] = []
+        for x in np.arange(np.ceil(x_min / _GRID_STEP) * _GRID_STEP, x_max, _GRID_STEP):
+            ends += [(x, y_min), (x, y_max)]
+        for y in np.arange(np.ceil(y_min / _GRID_STEP) * _GRID_STEP, y_max, _GRID_STEP):
+            ends += [(x_min, y), (x_max, y)]
+        flat = np.array(ends, float).reshape(-1, 2)
+        return np.column_stack([flat, np.full(len(flat), _GRID_HEIGHT)])
 
     def find_obstructions(self) -> list[tuple[Floats, Floats, float]]:
         """Return boxes of obstacles: lower and upper corner, shape (3,) each [m], and opacity."""
-        opacities = [
-            *((wall, 0.6 if self._is_divider(wall) else 0.0) for wall in self._walls),
-            *((one, 1.0) for one in self._furniture),
-        ]
-        return [
-            (*compute_world_box(shape.geometry, shape.placement), opacity)
-            for shape, opacity in opacities
-        ]
+        boxes: list[tuple[Floats, Floats, float]] = []
+        for wall in self._walls:
+            lower, upper = compute_world_box(wall.geometry, wall.placement)
+            boxes.append((lower, upper, 0.6 if self._is_divider(wall) else 0.0))
+        for shape in self._furniture:
+            lower, upper = compute_world_box(shape.geometry, shape.placement)
+            boxes.append((lower, upper, 1.0))
+        return boxes
 
     def _find_inside(self, shape: pin.GeometryObject) -> tuple[int, float]:
         """Return a wall's thin axis in its frame, and the sign of its side facing the centre."""
@@ -122,6 +130,7 @@ class Room:
         return axis, 1.0 if towards > 0.0 else -1.0
 
     def _is_divider(self, shape: pin.GeometryObject) -> bool:
+        """Return whether a wall divides the arena."""
         axis, sign = self._find_inside(shape)
         behind = np.zeros(3)
         behind[axis] = -sign * (float(shape.geometry.halfSide[axis]) + _BEYOND)
@@ -130,35 +139,33 @@ class Room:
         return bool(x_min < x < x_max and y_min < y < y_max)
 
     def _make_wall_parts(self, shape: pin.GeometryObject) -> list[Part]:
-        half, colour = np.asarray(shape.geometry.halfSide), tuple(map(float, shape.meshColor))
+        """Return the sides of a wall; see `make_box` for their numbers."""
+        half = np.asarray(shape.geometry.halfSide)
+        colour = tuple(float(value) for value in shape.meshColor)
 
         def make_part(name: str, opacity: float, sides: tuple[int, ...]) -> Part:
             solid = make_box(-half, half, sides).transform(shape.placement)
-            return Part(
-                f"walls/{shape.name}/{name}", solid, colour, opacity, shadow=False, one_sided=True
-            )
+            path = f"walls/{shape.name}/{name}"
+            return Part(path, solid, colour, opacity, shadow=False, one_sided=True)
 
         if self._is_divider(shape):
             return [make_part("sides", _DIVIDER, (0, 1, 2, 3, 5))]
         axis, sign = self._find_inside(shape)
-        inside = 2 * axis + (sign > 0)
-        return [
-            make_part("inside", 1.0, (inside,)),
-            make_part("outside", _VEIL, tuple(s for s in range(4) if s != inside)),
-        ]
+        inside = 2 * axis + (1 if sign > 0 else 0)
+        outside = tuple(side for side in range(4) if side != inside)
+        return [make_part("inside", 1.0, (inside,)), make_part("outside", _OUTSIDE, outside)]
 
 
 def load_drawn_parts(shape: pin.GeometryObject) -> list[tuple[Solid, tuple[float, ...]]]:
     """Load meshes, in the shape's frame, and colours of a shape, from its file if available."""
-    colour = tuple(float(c) for c in shape.meshColor)
-    if shape.meshPath and Path(shape.meshPath).is_file():
-        parts = load_parts(shape.meshPath, np.asarray(shape.meshScale).ravel(), detail=_DETAIL)
-        own = bool(shape.overrideMaterial)
-        return [
-            (shade(part.vertices, part.faces), colour if own else part.colour or colour)
-            for part in parts
-        ]
-    return [(to_solid(shape.geometry), colour)]
+    colour = tuple(float(value) for value in shape.meshColor)
+    if not shape.meshPath or not Path(shape.meshPath).is_file():
+        return [(to_solid(shape.geometry), colour)]
+    drawn: list[tuple[Solid, tuple[float, ...]]] = []
+    for part in load_parts(shape.meshPath, np.asarray(shape.meshScale).ravel(), detail=_DETAIL):
+        own_colour = None if shape.overrideMaterial else part.colour
+        drawn.append((shade(part.vertices, part.faces), own_colour or colour))
+    return drawn
 
 
 def is_wall(shape: pin.GeometryObject) -> bool:
@@ -167,18 +174,20 @@ def is_wall(shape: pin.GeometryObject) -> bool:
         return False
     half = np.asarray(shape.geometry.halfSide)
     top = shape.placement.translation[2] + half[2]
-    upright = abs(shape.placement.rotation[2, 2]) > 0.999
-    return bool(
-        upright
-        and 2.0 * half[:2].min() <= _THIN
-        and top >= _HIGH
-        and half[:2].max() > 2.0 * half[:2].min()
-    )
+    is_upright = abs(shape.placement.rotation[2, 2]) > 0.999
+    is_thin = 2.0 * half[:2].min() <= _THIN
+    is_long = half[:2].max() > 2.0 * half[:2].min()
+    return bool(is_upright and is_thin and top >= _HIGH and is_long)
 
 
 def _find_edges(shape: pin.GeometryObject) -> Floats:
     """Return the twelve edges of a box, shape (24, 3) [m]."""
     half = np.asarray(shape.geometry.halfSide)
-    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
-    pairs = [(a, b) for a in range(8) for b in range(a) if np.abs(signs[a] - signs[b]).sum() == 2]
-    return np.asarray((signs * half)[np.array(pairs).ravel()])
+    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    ends: list[int] = []
+    for a in range(8):
+        for b in range(a):
+            # The corners of an edge differ in one sign.
+            if np.abs(signs[a] - signs[b]).sum() == 2:
+                ends += [a, b]
+    return np.asarray((signs * half)[ends])

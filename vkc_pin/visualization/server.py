@@ -20,12 +20,18 @@ from meshcat.servers.tree import find_node, walk
 from meshcat.servers.zmqserver import ZMQWebSocketBridge
 
 LOOPBACK = "127.0.0.1"
-_PATIENCE = 5.0  # [s] until a command gets an error for an answer
-_MAX_MESSAGE = 2**28  # [bytes]
-_MAX_BACKLOG = 2**26  # [bytes] of commands that wait for a page, besides the scene
-_MAX_WAITING = 2**29  # [bytes] of commands that wait for all pages
-_OVERHEAD = 2500  # [bytes] that a waiting command takes, as measured with tornado 6.6
-_MAX_DEPTH = 50  # of the tree of shown objects, which is walked recursively
+# [s] until a command gets an error for an answer
+_PATIENCE = 5.0
+# [bytes]
+_MAX_MESSAGE = 2**28
+# [bytes] of commands that wait for a page, besides the scene
+_MAX_BACKLOG = 2**26
+# [bytes] of commands that wait for all pages
+_MAX_WAITING = 2**29
+# [bytes] that a waiting command takes, as measured with tornado 6.6
+_OVERHEAD = 2500
+# of the tree of shown objects, which is walked recursively
+_MAX_DEPTH = 50
 _is_here = re.compile(r"(localhost|127\.0\.0\.1|\[::1\])(:\d+)?", re.IGNORECASE).fullmatch
 
 
@@ -47,17 +53,22 @@ class LoopbackBridge(ZMQWebSocketBridge):
         tornado refuses web sockets whose origin is not the requested host.
         """
         app = super().make_app()
-        listen, find = app.listen, app.find_handler
+        listen = app.listen
+        find_handler = app.find_handler
 
-        def find_here(request, **options):  # type: ignore[no-untyped-def]
+        def listen_here(port, **options):  # type: ignore[no-untyped-def]
+            options["address"] = LOOPBACK
+            return listen(port, **options)
+
+        def find_handler_here(request, **options):  # type: ignore[no-untyped-def]
             is_here = _is_here(request.headers.get("Host", ""))
             if is_here and "\0" not in urllib.parse.unquote(request.path):
-                return find(request, **options)
+                return find_handler(request, **options)
             refusal = {"status_code": 404 if is_here else 403}
             return app.get_handler_delegate(request, tornado.web.ErrorHandler, refusal)
 
-        app.listen = lambda port, **options: listen(port, **{**options, "address": LOOPBACK})
-        app.find_handler = find_here
+        app.listen = listen_here
+        app.find_handler = find_handler_here
         return app
 
     def setup_zmq(self, url):  # type: ignore[no-untyped-def]

@@ -19,11 +19,18 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.meshes import MeshPart, simplify_mesh
 from vkc_pin.world.models.shapes import triangulate
 
-_CREASE = np.radians(35.0)  # faces that meet at a larger angle keep an edge between them
-_SIDES = 8  # of a tube
-_GRAIN = 2.0**-14  # rounding of vertices, for better compression [m]
-_MAX_CACHED_SOLIDS = 512  # that a process keeps: robots are drawn again and again
+# Faces that meet at a larger angle keep an edge between them.
+_CREASE = np.radians(35.0)
+# sides of a tube
+_SIDES = 8
+# [m] rounding of vertices, and rounding of normals, for better compression
+_GRAIN = 2.0**-14
+_NORMAL_GRAIN = 2.0**-6
+# that a process keeps: robots are drawn again and again
+_MAX_CACHED_SOLIDS = 512
 _GHOST_OPACITY = 0.30
+# [m] distance of the sun
+_SUN_DISTANCE = 20.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,9 +51,8 @@ class Solid:
         """Return the mesh transformed by `placement`."""
         rotation = np.asarray(placement.rotation)
         vertices = self.vertices @ rotation.T + np.asarray(placement.translation)
-        return Solid(
-            vertices.astype(np.float32), self.faces, (self.normals @ rotation.T).astype(np.float32)
-        )
+        normals = self.normals @ rotation.T
+        return Solid(vertices.astype(np.float32), self.faces, normals.astype(np.float32))
 
 
 def to_solid(shape: coal.CollisionGeometry) -> Solid:
@@ -61,6 +67,7 @@ def shade(vertices: Floats, faces: NDArray[np.int64]) -> Solid:
 
 @lru_cache(maxsize=_MAX_CACHED_SOLIDS)
 def _shade(vertices: bytes, faces: bytes) -> Solid:
+    """Add normals to triangles that are given by their bytes, for the cache."""
     import trimesh
 
     triangles = trimesh.Trimesh(
@@ -69,30 +76,37 @@ def _shade(vertices: bytes, faces: bytes) -> Solid:
         process=False,
     )
     mesh = trimesh.graph.smooth_shade(triangles, angle=_CREASE)
-    points = (np.round(np.asarray(mesh.vertices) / _GRAIN) * _GRAIN).astype(np.float32)
-    normals = (np.round(np.asarray(mesh.vertex_normals) * 64.0) / 64.0).astype(np.float32)
-    arrays = (points, np.asarray(mesh.faces, np.uint32), normals)
-    for array in arrays:
+    points = _round(mesh.vertices, _GRAIN)
+    normals = _round(mesh.vertex_normals, _NORMAL_GRAIN)
+    indices = np.asarray(mesh.faces, np.uint32)
+    for array in (points, normals, indices):
         array.flags.writeable = False
-    return Solid(*arrays)
+    return Solid(points, indices, normals)
+
+
+def _round(values: Any, grain: float) -> NDArray[np.float32]:
+    """Round values to multiples of a power of two."""
+    return (np.round(np.asarray(values) / grain) * grain).astype(np.float32)
 
 
 def simplify(solid: Solid, width: float) -> Solid:
     """Simplify a mesh by merging the vertices in each cell of a grid of `width` [m]."""
-    part = simplify_mesh(
-        MeshPart(solid.vertices.astype(float), solid.faces.astype(np.int64)), width
-    )
-    return shade(part.vertices, part.faces)
+    part = MeshPart(solid.vertices.astype(float), solid.faces.astype(np.int64))
+    simple = simplify_mesh(part, width)
+    return shade(simple.vertices, simple.faces)
 
 
 def merge_solids(solids: list[Solid]) -> Solid:
     """Merge meshes into one."""
-    offsets = np.cumsum([0, *(len(s.vertices) for s in solids)])
-    faces = [s.faces + np.uint32(offset) for s, offset in zip(solids, offsets[:-1], strict=True)]
+    faces: list[NDArray[np.uint32]] = []
+    offset = 0  # vertices of the meshes before
+    for solid in solids:
+        faces.append(solid.faces + np.uint32(offset))
+        offset += len(solid.vertices)
     return Solid(
-        np.concatenate([s.vertices for s in solids]),
+        np.concatenate([solid.vertices for solid in solids]),
         np.concatenate(faces),
-        np.concatenate([s.normals for s in solids]),
+        np.concatenate([solid.normals for solid in solids]),
     )
 
 
@@ -102,16 +116,25 @@ def make_box(lower: Floats, upper: Floats, sides: tuple[int, ...] = (0, 1, 2, 3,
     faces: list[NDArray[np.int64]] = []
     normals: list[Floats] = []
     for k, side in enumerate(sides):
-        axis, positive = divmod(side, 2)
-        u, v = (axis + 1) % 3, (axis + 2) % 3
-        corner = np.tile(lower, (4, 1)).astype(float)
-        corner[:, axis] = (lower, upper)[positive][axis]
-        corner[1:3, u], corner[2:4, v] = upper[u], upper[v]
-        order = [[0, 1, 2], [0, 2, 3]] if positive else [[0, 2, 1], [0, 3, 2]]
-        vertices.append(corner)
+        axis, is_positive = divmod(side, 2)
+        u = (axis + 1) % 3
+        v = (axis + 2) % 3
+        # Around the side: (0, 0), (1, 0), (1, 1), (0, 1) along u and v.
+        corners = np.tile(lower, (4, 1)).astype(float)
+        corners[1:3, u] = upper[u]
+        corners[2:4, v] = upper[v]
+        if is_positive:
+            corners[:, axis] = upper[axis]
+            order = [[0, 1, 2], [0, 2, 3]]
+            normal = np.eye(3)[axis]
+        else:
+            corners[:, axis] = lower[axis]
+            order = [[0, 2, 1], [0, 3, 2]]
+            normal = -np.eye(3)[axis]
+        vertices.append(corners)
         faces.append(np.array(order) + 4 * k)
-        normals.append(np.tile((2.0 * positive - 1.0) * np.eye(3)[axis], (4, 1)))
-    return _solid(np.concatenate(vertices), np.concatenate(faces), np.concatenate(normals))
+        normals.append(np.tile(normal, (4, 1)))
+    return _make_solid(np.concatenate(vertices), np.concatenate(faces), np.concatenate(normals))
 
 
 def make_tube(points: Floats, radius: float) -> Solid | None:
@@ -129,28 +152,30 @@ def make_tube(points: Floats, radius: float) -> Solid | None:
         return None
     along = np.gradient(line, axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1), 1e-9)[:, None]
+    # A direction across the line at each point, carried along without twist.
     across = np.empty_like(line)
     side = np.eye(3)[int(np.argmin(np.abs(along[0])))]
-    for i, direction in enumerate(along):  # carried along without twist
+    for i, direction in enumerate(along):
         side = side - direction * (side @ direction)
         side /= max(float(np.linalg.norm(side)), 1e-9)
         across[i] = side
     other = np.cross(along, across)
-    angle = 2.0 * np.pi * np.arange(_SIDES) / _SIDES
-    normals = (
-        np.cos(angle)[None, :, None] * across[:, None]
-        + np.sin(angle)[None, :, None] * other[:, None]
-    )
+    angles = 2.0 * np.pi * np.arange(_SIDES) / _SIDES
+    cosines = np.cos(angles)[None, :, None]
+    sines = np.sin(angles)[None, :, None]
+    normals = cosines * across[:, None] + sines * other[:, None]
     vertices = line[:, None] + radius * normals
+    # Two triangles between neighbouring vertices a and b of a ring and those of the next ring.
     ring, k = np.meshgrid(np.arange(len(line) - 1) * _SIDES, np.arange(_SIDES), indexing="ij")
-    a, b = ring + k, ring + (k + 1) % _SIDES
-    faces = np.concatenate(
-        [np.stack([a, b, b + _SIDES], axis=-1), np.stack([a, b + _SIDES, a + _SIDES], axis=-1)]
-    )
-    return _solid(vertices.reshape(-1, 3), faces.reshape(-1, 3), normals.reshape(-1, 3))
+    a = ring + k
+    b = ring + (k + 1) % _SIDES
+    first = np.stack([a, b, b + _SIDES], axis=-1)
+    second = np.stack([a, b + _SIDES, a + _SIDES], axis=-1)
+    faces = np.concatenate([first, second])
+    return _make_solid(vertices.reshape(-1, 3), faces.reshape(-1, 3), normals.reshape(-1, 3))
 
 
-def _solid(vertices: NDArray[Any], faces: NDArray[Any], normals: NDArray[Any]) -> Solid:
+def _make_solid(vertices: NDArray[Any], faces: NDArray[Any], normals: NDArray[Any]) -> Solid:
     return Solid(vertices.astype(np.float32), faces.astype(np.uint32), normals.astype(np.float32))
 
 
@@ -212,13 +237,12 @@ class Sun(g.Object):
 
     def __init__(self, centre: Floats, reach: float, camera: Floats) -> None:
         g.SceneElement.__init__(self)
-        towards = np.array([camera[0], camera[1], 0.0]) / max(
-            1e-9, float(np.hypot(camera[0], camera[1]))
-        )
+        x, y, _ = camera
+        towards = np.array([x, y, 0.0]) / max(1e-9, float(np.hypot(x, y)))
         left = np.array([towards[1], -towards[0], 0.0])
-        self.position = centre + 20.0 * (
-            0.35 * towards + 0.40 * left + 0.85 * np.array([0.0, 0.0, 1.0])
-        )
+        up = np.array([0.0, 0.0, 1.0])
+        direction = 0.35 * towards + 0.40 * left + 0.85 * up
+        self.position = centre + _SUN_DISTANCE * direction
         self.reach = reach + 2.0
 
     def lower(self) -> dict[str, Any]:
@@ -234,18 +258,27 @@ class Sun(g.Object):
             "near": 1.0,
             "far": 60.0,
         }
-        shadow = {"bias": -0.0004, "normalBias": 0.02, "radius": 2.5, "mapSize": [2048, 2048]}
         camera = {"uuid": f"{self.uuid}-camera", "type": "OrthographicCamera", "zoom": 1.0, **box}
-        light = {"uuid": self.uuid, "type": "DirectionalLight", "color": 0xFFFFFF, "intensity": 0.5}
+        shadow = {
+            "bias": -0.0004,
+            "normalBias": 0.02,
+            "radius": 2.5,
+            "mapSize": [2048, 2048],
+            "camera": camera,
+        }
+        light = {
+            "uuid": self.uuid,
+            "type": "DirectionalLight",
+            "color": 0xFFFFFF,
+            "intensity": 0.5,
+            "matrix": matrix.T.ravel().tolist(),
+            "shadow": shadow,
+        }
         return {
             "metadata": {"version": 4.5, "type": "Object"},
             "geometries": [],
             "materials": [],
-            "object": {
-                **light,
-                "matrix": matrix.T.ravel().tolist(),
-                "shadow": {**shadow, "camera": camera},
-            },
+            "object": light,
         }
 
 
@@ -265,9 +298,13 @@ def make_material(
     colour: Sequence[float], opacity: float = 1.0, *, one_sided: bool = False
 ) -> g.Material:
     """Make a slightly shiny material; translucent ones do not write to the depth buffer."""
-    options = {"shininess": 25, "specular": 0x1A1A1A, "side": 0 if one_sided else 2}
     return g.MeshPhongMaterial(
-        color=encode_colour(colour), opacity=opacity, depthWrite=opacity >= 1.0, **options
+        color=encode_colour(colour),
+        opacity=opacity,
+        depthWrite=opacity >= 1.0,
+        shininess=25,
+        specular=0x1A1A1A,
+        side=0 if one_sided else 2,
     )
 
 
@@ -282,7 +319,8 @@ def add_node(taken: set[str], above: str, *names: str) -> str:
 
     Invalid characters become "_", and "_" is appended until the path is unique.
     """
-    path = "/".join([above, *(re.sub(r"[^\w.\-]", "_", name) for name in names)])
+    valid = [re.sub(r"[^\w.\-]", "_", name) for name in names]
+    path = "/".join([above, *valid])
     while path in taken:
         path += "_"
     taken.add(path)

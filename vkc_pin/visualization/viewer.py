@@ -36,10 +36,10 @@ if TYPE_CHECKING:
 
 # Commands of a scene are 1.5 % larger than at level 9, which takes four times as long.
 _LEVEL = 6
-_PATIENCE = 10.0  # [s] that the server may take for an answer
-_server: tuple[subprocess.Popen[bytes], str, str] | None = (
-    None  # the process, its address for commands, and for browsers
-)
+# [s] that the server may take for an answer
+_PATIENCE = 10.0
+# The process, its address for commands, and for browsers.
+_server: tuple[subprocess.Popen[bytes], str, str] | None = None
 
 
 def show(
@@ -76,7 +76,8 @@ def show(
     if in_notebook():
         from IPython.display import HTML
 
-        page, name = html.escape(_make_page(scene, plan, frames)), html.escape(scene.name)
+        page = html.escape(_make_page(scene, plan, frames))
+        name = html.escape(scene.name)
         style = f"width: 100%; height: {height}px; border: none"
         return cast(Any, HTML)(
             f'<div><iframe srcdoc="{page}" style="{style}" title="{name}"></iframe></div>'
@@ -112,9 +113,10 @@ def animate(plan: CheckedMotion, viewer: meshcat.Visualizer | None = None) -> me
         raise InputError(
             "a scene has no motion", field="plan", expected="a Plan", got=type(plan).__name__
         )
-    viewer = (
-        open_viewer() if viewer is None else check_instance(viewer, meshcat.Visualizer, "viewer")
-    )
+    if viewer is None:
+        viewer = open_viewer()
+    else:
+        check_instance(viewer, meshcat.Visualizer, "viewer")
     _draw(viewer, scene, checked)
     return viewer
 
@@ -140,7 +142,9 @@ def to_html(
     Raises:
         InputError: Neither a plan nor a scene, or something that cannot be drawn.
     """
-    return write_atomically(path, _make_page(*_split(plan_or_scene), frames).encode("utf-8"))
+    scene, plan = _split(plan_or_scene)
+    page = _make_page(scene, plan, frames)
+    return write_atomically(path, page.encode("utf-8"))
 
 
 def open_viewer() -> meshcat.Visualizer:
@@ -177,8 +181,9 @@ def _make_window(address: str) -> Any:
             self.zmq_socket.setsockopt(zmq.RCVTIMEO, round(1000.0 * _PATIENCE))
 
         def wait(self) -> str:
-            while (answer := super().wait()) != "ok":  # the server answers before a page is open
-                pass
+            answer = super().wait()
+            while answer != "ok":  # the server answers before a page is open
+                answer = super().wait()
             return str(answer)
 
         def send(self, command: Any) -> None:
@@ -202,9 +207,11 @@ def _make_window(address: str) -> Any:
 
 
 def _start_server() -> tuple[subprocess.Popen[bytes], str, str]:
+    """Start a server; return the process, its address for commands, and for browsers."""
     # -P: the folder of that file is no place to import from.
     command = [sys.executable, "-P", "-u", str(Path(__file__).with_name("server.py"))]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    folders = [folder for folder in sys.path if folder]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(folders)}
     process = subprocess.Popen(
         command,
         stdin=subprocess.PIPE,
@@ -215,16 +222,21 @@ def _start_server() -> tuple[subprocess.Popen[bytes], str, str]:
     )
     atexit.register(process.kill)
     assert process.stdout is not None
-    addresses = [process.stdout.readline().decode().strip().partition("=")[2] for _ in range(2)]
-    if not all(addresses):
+    addresses: list[str] = []
+    for _ in range(2):  # lines "zmq_url=..." and "web_url=..."
+        line = process.stdout.readline().decode().strip()
+        addresses.append(line.partition("=")[2])
+    command_address, browser_address = addresses
+    if not command_address or not browser_address:
         process.kill()
         raise VkcError(
             "meshcat's server does not start; is a port from 6000 and one from 7000 on free?"
         )
-    return process, addresses[0], addresses[1]
+    return process, command_address, browser_address
 
 
 def _split(plan_or_scene: Any) -> tuple[Scene, CheckedMotion | None]:
+    """Return the scene, and the motion if there is one."""
     if isinstance(plan_or_scene, Scene):
         return plan_or_scene, None
     if isinstance(plan_or_scene, CheckedMotion):
@@ -243,14 +255,16 @@ def _draw(
     play: bool = True,
     frames: Mapping[str, pin.SE3] | None = None,
 ) -> Drawing:
+    """Draw a scene, and a motion in it, into a viewer."""
     from vkc_pin.visualization.drawing import Drawing
 
-    motion = () if plan is None else (plan.trajectory, plan.report)
-    named = check_mapping(
-        {} if frames is None else frames, "frames", "names, each with a pinocchio.SE3"
-    )
+    given = {} if frames is None else frames
+    named = check_mapping(given, "frames", "names, each with a pinocchio.SE3")
     placed = {name: as_placement(where, name=f"frames.{name}") for name, where in named.items()}
-    drawing = Drawing(viewer, scene, *motion)
+    if plan is None:
+        drawing = Drawing(viewer, scene)
+    else:
+        drawing = Drawing(viewer, scene, plan.trajectory, plan.report)
     drawing.draw(play=play, frames=placed)
     return drawing
 
@@ -271,18 +285,20 @@ def _describe_film(scene: Scene, plan: CheckedMotion | None) -> dict[str, Any]:
         return {"duration": 0.0, "phases": [], "notes": [], "because": [], "headline": scene.name}
     begin = float(plan.trajectory.times[0])
     times = plan.trajectory.times - begin
+    phases = [
+        {"name": phase.name, "last": float(times[phase.last])} for phase in plan.trajectory.phases
+    ]
+    notes: list[dict[str, Any]] = []
+    for violation in plan.report.violations:
+        text = f"{violation.constraint} {violation.subject}: {violation.detail}"
+        notes.append({"text": text, "time": violation.time - begin})
+    outcome = "success" if plan.success else f"FAILED, {plan.status}"
     return {
         "duration": float(times[-1]),
-        "phases": [
-            {"name": phase.name, "last": float(times[phase.last])}
-            for phase in plan.trajectory.phases
-        ],
-        "notes": [
-            {"text": f"{v.constraint} {v.subject}: {v.detail}", "time": v.time - begin}
-            for v in plan.report.violations
-        ],
+        "phases": phases,
+        "notes": notes,
         "because": list(plan.report.notes),
-        "headline": f"{scene.name}: {'success' if plan.success else 'FAILED, ' + plan.status}",
+        "headline": f"{scene.name}: {outcome}",
     }
 
 
@@ -307,15 +323,18 @@ def render_page(recorder: Recorder, *, title: str, film: dict[str, Any]) -> str:
     import umsgpack  # type: ignore[import-untyped]
 
     viewer = Path(meshcat.__file__).parent / "viewer" / "dist" / "main.min.js"
-    packed = [umsgpack.packb(command) for command in recorder.commands]
+    # Each command follows its length, an unsigned 32-bit number.
+    parts: list[bytes] = []
+    for command in recorder.commands:
+        packed = umsgpack.packb(command)
+        parts += [struct.pack("<I", len(packed)), packed]
+    commands = b"".join(parts)
     template = (Path(__file__).parent / "page.html").read_text(encoding="utf-8")
     pieces = {
         "TITLE": html.escape(title),
         "FILM": json.dumps(film).replace("<", "\\u003c"),
         "VIEWER": _pack_file(viewer),
-        "COMMANDS": _pack(
-            b"".join(struct.pack("<I", len(command)) + command for command in packed)
-        ),
+        "COMMANDS": _pack(commands),
     }
     return re.sub(r"%(TITLE|FILM|VIEWER|COMMANDS)%", lambda match: pieces[match[1]], template)
 
@@ -326,4 +345,6 @@ def _pack_file(file: Path) -> str:
 
 
 def _pack(data: bytes) -> str:
-    return base64.b64encode(gzip.compress(data, _LEVEL, mtime=0)).decode("ascii")
+    """Return data as compressed text that the page unpacks."""
+    compressed = gzip.compress(data, _LEVEL, mtime=0)
+    return base64.b64encode(compressed).decode("ascii")

@@ -67,7 +67,7 @@ def limit_search(
 ) -> None:
     """Limit the search for solutions that do not exist."""
     monkeypatch.setattr(postures, "TRIES", tries)
-    monkeypatch.setattr(attempt, "_STANDS", base_poses)
+    monkeypatch.setattr(attempt, "_HANDLE_POSES", base_poses)
 
 
 def plan_failure(

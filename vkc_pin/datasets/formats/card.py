@@ -8,7 +8,10 @@ from typing import Any
 
 import yaml
 
-_ROWS = 12  # of reasons
+# reasons in the card
+_ROWS = 12
+# characters of a reason
+_REASON_LENGTH = 120
 
 
 def make_card(
@@ -23,18 +26,20 @@ def make_card(
         records: Records of episodes.
         failures: Records of failed attempts.
     """
-    size = next((name for most, name in _SIZES if len(records) < most), _SIZES[-1][1])
     head = {
         "license": str(about["license"]).lower(),
         "task_categories": ["robotics"],
         "tags": ["mobile-manipulation", "whole-body-motion", "vkc_pin", "LeRobot"],
         "pretty_name": about["name"],
-        "size_categories": [size],
+        "size_categories": [_choose_size_category(len(records))],
     }
     hours = sum(float(record["duration"]) for record in records) / 3600.0
     attempts = len(records) + len(failures)
     share = f"{100.0 * len(records) / attempts:.1f} %" if attempts else "–"
-    reasons = Counter(f"{r['status']}: {str(r.get('reason', ''))[:120]}" for r in failures)
+    reasons = Counter[str]()
+    for failure in failures:
+        reason = str(failure.get("reason", ""))[:_REASON_LENGTH]
+        reasons[f"{failure['status']}: {reason}"] += 1
     failed = [f"- {text} ({count})" for text, count in reasons.most_common(_ROWS)]
     versions = [f"| {name} | {value} |" for name, value in about["versions"].items()]
     parts = [
@@ -44,7 +49,7 @@ def make_card(
         "with its scene, planned by vkc_pin. The independent validation accepted every one: joint "
         "limits, velocities, accelerations, closure of grasps, clearances along the whole motion, "
         "and the goal. They are kinematic: nothing was recorded on a robot.",
-        _counted(records),
+        _make_table_of_counts(records),
         "## Origin",
         f"The recipe below, of digest `{about['digest']}`, and a number determine an episode. "
         f"{attempts} numbers were tried, {share} of which became episodes; `failures.csv` has the "
@@ -72,12 +77,21 @@ _FILES = """\
 - `journal.jsonl`, `work/`: for resuming generation; not needed to use the data"""
 
 
-def _counted(records: Sequence[Mapping[str, Any]]) -> str:
+def _choose_size_category(count: int) -> str:
+    """Return the hubs' category of a number of episodes."""
+    for most, name in _SIZES:
+        if count < most:
+            return name
+    return _SIZES[-1][1]
+
+
+def _make_table_of_counts(records: Sequence[Mapping[str, Any]]) -> str:
     """Return a table of the numbers of episodes by task, robot and kind."""
     rows = ["| | episodes |", "| --- | --- |"]
     for field in ("task", "robot", "kind"):
         counts = Counter(record[field] for record in records)
         rows += [f"| {field} {name} | {count} |" for name, count in sorted(counts.items())]
     for field in ("room", "scene"):
-        rows.append(f"| {field}s | {len({record[field] for record in records})} |")
+        values = {record[field] for record in records}
+        rows.append(f"| {field}s | {len(values)} |")
     return "\n".join(rows)

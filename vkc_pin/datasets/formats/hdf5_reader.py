@@ -15,7 +15,10 @@ from vkc_pin.utils.optional_imports import import_optional
 
 MAX_BYTES = 40_000_000
 """Largest array that is read [bytes]: 200 000 waypoints of 25 coordinates."""
-_MAX_TEXT = 50_000_000  # [bytes] of an attribute
+# [bytes] of an attribute
+_MAX_TEXT = 50_000_000
+# [bytes] of a text in an array
+_MAX_ITEM = 100
 _KINDS = {"f": "floating-point numbers", "i": "integers", "u": "unsigned integers", "S": "texts"}
 
 
@@ -44,8 +47,12 @@ def open_hdf5(path: Path) -> Iterator[Group]:
     except InputError:
         raise
     except OSError as error:
-        problem, expected = "not an HDF5 file, or a damaged one", "a shard of a dataset"
-        raise InputError(problem, file=path, expected=expected, got=str(error)) from error
+        raise InputError(
+            "not an HDF5 file, or a damaged one",
+            file=path,
+            expected="a shard of a dataset",
+            got=str(error),
+        ) from error
     # h5py raises these for parts that it does not understand.
     except (LookupError, TypeError, ValueError, RuntimeError, MemoryError, OverflowError) as error:
         got = f"{type(error).__name__}: {error}"
@@ -64,7 +71,9 @@ class Group:
     """
 
     def __init__(self, group: Any, file: Path, name: str = "") -> None:
-        self.handle, self.file, self.name = group, file, name
+        self.handle = group
+        self.file = file
+        self.name = name
 
     def make_error(
         self, problem: str, name: str = "", *, expected: object = None, got: object = None
@@ -97,7 +106,7 @@ class Group:
 
         Args:
             name: Name of the array, with those of groups around it: "obs/gripper".
-            dtype: Its type, such as "f4"; "S" for texts of up to 100 bytes.
+            dtype: Its type, such as "f4"; "S" for texts of up to `_MAX_ITEM` bytes.
             shape: Its shape, with None for any number.
             largest: Its maximum size [bytes].
         """
@@ -107,21 +116,23 @@ class Group:
         item = self._find(name, require_h5py().Dataset, "an array")
         if item.is_virtual or item.external:
             raise self.make_error("the array is stored in other files", name)
-        found, expected = item.dtype, np.dtype(dtype)
-        fits = found.itemsize <= 100 if dtype == "S" else found.itemsize == expected.itemsize
-        if found.kind != expected.kind or not fits:
-            kind = f"{_KINDS[expected.kind]} of {expected.itemsize or 'at most 100'} bytes"
+        found = item.dtype
+        expected = np.dtype(dtype)
+        if dtype == "S":
+            has_size = found.itemsize <= _MAX_ITEM
+        else:
+            has_size = found.itemsize == expected.itemsize
+        if found.kind != expected.kind or not has_size:
+            kind = f"{_KINDS[expected.kind]} of {expected.itemsize or f'at most {_MAX_ITEM}'} bytes"
             raise self.make_error("wrong type of array", name, expected=kind, got=str(found))
-        if item.shape is None or not (
-            len(item.shape) == len(shape)
-            and all(b in (None, a) for a, b in zip(item.shape, shape, strict=True))
-        ):
+        if not _has_shape(item, shape):
             sizes = ", ".join("any" if size is None else str(size) for size in shape)
             raise self.make_error(
                 "wrong shape", name, expected=f"({sizes})", got=format_value(item.shape)
             )
         # A chunk is unpacked whole, and may be larger than an array that can grow.
-        size = max(math.prod(item.shape), math.prod(item.chunks or ())) * found.itemsize
+        count = max(math.prod(item.shape), math.prod(item.chunks or ()))
+        size = count * found.itemsize
         if size > largest:
             raise self.make_error(
                 "too large", name, expected=f"at most {largest:g} bytes", got=f"{size:g}"
@@ -145,11 +156,16 @@ class Group:
         """Return an attribute that is a whole number of at least 0."""
         value = self.read_attribute(name)
         if not isinstance(value, np.integer) or value < 0:
-            expected, got = "a whole number of at least 0", format_value(value)
-            raise self.make_error("wrong value", name, expected=expected, got=got)
+            raise self.make_error(
+                "wrong value",
+                name,
+                expected="a whole number of at least 0",
+                got=format_value(value),
+            )
         return int(value)
 
     def _find(self, name: str, kind: Any, expected: str) -> Any:
+        """Return a member of a kind, which `expected` describes."""
         link = self.handle.get(name, getlink=True)
         if link is None:
             raise self.make_error("missing", name, expected=expected)
@@ -168,6 +184,16 @@ class Group:
             raise self.make_error("missing", name, expected="an attribute")
         identifier = attributes.get_id(name)
         if identifier.shape != () or identifier.get_type().get_size() > _MAX_TEXT:
-            expected, got = "one value", f"shape {identifier.shape}"
-            raise self.make_error("wrong shape", name, expected=expected, got=got)
+            got = f"shape {identifier.shape}"
+            raise self.make_error("wrong shape", name, expected="one value", got=got)
         return attributes[name]
+
+
+def _has_shape(item: Any, shape: tuple[int | None, ...]) -> bool:
+    """Return whether an array has a shape, whose sizes of None are any."""
+    if item.shape is None or len(item.shape) != len(shape):
+        return False
+    for size, expected in zip(item.shape, shape, strict=True):
+        if expected is not None and size != expected:
+            return False
+    return True

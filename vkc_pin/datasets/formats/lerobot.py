@@ -28,13 +28,20 @@ from vkc_pin.world.models.robot import Robot
 VERSION = "v3.0"
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 _EPISODES = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-_CHUNK = 1000  # files of a folder
-_SIZE = 100  # [MB] of a file; files are cut before they get there
-_ROWS = 200_000  # frames of a file
-_IMAGES = 90_000_000  # bytes of images in a file, after which the next one is begun
-_TOLERANCE = 1e-5  # of numbers made on another machine, relative and absolute
-_SCHEMA_KEY = "huggingface"  # metadata of the package `datasets` in the schema of a Parquet file
-_SEEN = "_image"  # end of the names of what becomes an image
+# files of a folder
+_CHUNK = 1000
+# [MB] of a file; files are cut before they get there
+_SIZE = 100
+# frames of a file
+_ROWS = 200_000
+# bytes of images in a file, after which the next one is begun
+_IMAGES = 90_000_000
+# of numbers made on another machine, relative and absolute
+_TOLERANCE = 1e-5
+# metadata of the package `datasets` in the schema of a Parquet file
+_SCHEMA_KEY = "huggingface"
+# end of the names of pictures that are stored; depths and segments are not
+_IMAGE_SUFFIX = "_image"
 _KINDS = {
     "timestamp": "float32",
     "frame_index": "int64",
@@ -51,8 +58,10 @@ _COLUMNS = {
 }
 """Feature → its parts among the samples of an episode."""
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
-_BINS = 5000  # of the histograms for quantiles, as in LeRobot
-_PADDING = 1e-10  # beyond the smallest and the largest value, as in LeRobot
+# bins of the histograms for quantiles, as in LeRobot
+_BINS = 5000
+# beyond the smallest and the largest value, as in LeRobot
+_PADDING = 1e-10
 
 
 def require_pyarrow(rate: float) -> Any:
@@ -74,12 +83,10 @@ def require_pyarrow(rate: float) -> Any:
 
 def describe_task(about: Mapping[str, Any]) -> str:
     """Describe an episode as an instruction for language-conditioned policies."""
-    thing = str(about["kind"]).replace("_", " ")
-    return (
-        f"Bring the {thing} from one table to another."
-        if about["task"] == "fetch-place"
-        else f"Open the {thing}."
-    )
+    name = str(about["kind"]).replace("_", " ")
+    if about["task"] == "fetch-place":
+        return f"Bring the {name} from one table to another."
+    return f"Open the {name}."
 
 
 def write_lerobot(path: Path, episodes: Iterator[Episode], rate: float) -> Path:
@@ -122,7 +129,9 @@ class _Writer:
     """Writes frames as they come, and tables and statistics at the end."""
 
     def __init__(self, arrow: Any, folder: Path, rate: float) -> None:
-        self.arrow, self.folder, self.rate = arrow, folder, int(rate)
+        self.arrow = arrow
+        self.folder = folder
+        self.rate = int(rate)
 
     def run(self, episodes: Iterator[Episode]) -> None:
         """Write all episodes."""
@@ -154,102 +163,109 @@ class _Writer:
             "observation.environment_state": [*_HAND, "holding"],
             "action": [*joints, "gripper"],
         }
-        self.features: dict[str, dict[str, Any]] = {
-            **{
-                name: {"dtype": "float32", "shape": [len(own)], "names": own}
-                for name, own in names.items()
-            },
-            **{name: {"dtype": kind, "shape": [1], "names": None} for name, kind in _KINDS.items()},
-        }
+        self.features: dict[str, dict[str, Any]] = {}
+        for name, own in names.items():
+            self.features[name] = {"dtype": "float32", "shape": [len(own)], "names": own}
+        for name, kind in _KINDS.items():
+            self.features[name] = {"dtype": kind, "shape": [1], "names": None}
         self.tasks: dict[str, int] = {}
         self.rows: list[dict[str, Any]] = []
         self.stats: list[dict[str, dict[str, Floats]]] = []
-        self.frames, self.count = 0, 0  # of frames, and of files with frames
-        self._waiting: list[dict[str, Any]] = []
-        self._frames_waiting, self._bytes = 0, 0
+        self.frame_count = 0
+        self.file_count = 0  # files with frames
+        self._pending: list[dict[str, Any]] = []  # columns of episodes, for the next file
+        self._pending_frames = 0
+        self._pending_bytes = 0  # of images
 
     def add(self, episode: Episode) -> None:
         """Add an episode."""
-        found = sample_episode(episode, self.robot, self.rate)
-        count, number = len(found["time"]), len(self.rows)
-        task = self.tasks.setdefault(describe_task(episode.about), len(self.tasks))
-        columns: dict[str, Any] = {
-            name: np.hstack([found[part] for part in parts]).astype(np.float32)
-            for name, parts in _COLUMNS.items()
-        }
-        columns |= {
-            "timestamp": (np.arange(count) / self.rate).astype(np.float32),
-            "frame_index": np.arange(count),
-            "episode_index": np.full(count, number),
-            "index": np.arange(self.frames, self.frames + count),
-            "task_index": np.full(count, task),
-        }
+        number = len(self.rows)
+        task = describe_task(episode.about)
+        samples = sample_episode(episode, self.robot, self.rate)
+        count = len(samples["time"])
+        columns: dict[str, Any] = {}
+        for name, parts in _COLUMNS.items():
+            columns[name] = np.hstack([samples[part] for part in parts]).astype(np.float32)
+        columns["timestamp"] = (np.arange(count) / self.rate).astype(np.float32)
+        columns["frame_index"] = np.arange(count)
+        columns["episode_index"] = np.full(count, number)
+        columns["index"] = np.arange(self.frame_count, self.frame_count + count)
+        columns["task_index"] = np.full(count, self.tasks.setdefault(task, len(self.tasks)))
         stats = {name: _describe_rows(values) for name, values in columns.items()}
-        size = 0
-        for name, pixels in _pictures(episode):
-            shape, axes = list(pixels.shape[1:]), ["height", "width", "channels"]
+        byte_count = 0
+        for name, pixels in _iterate_images(episode):
+            shape = list(pixels.shape[1:])
+            axes = ["height", "width", "channels"]
             self.features[name] = {"dtype": "image", "shape": shape, "names": axes}
             stats[name] = _describe_images(pixels)
+            files = [_encode_png(image) for image in pixels]
             columns[name] = [
-                {"bytes": _png(one), "path": f"frame-{k:06d}.png"} for k, one in enumerate(pixels)
+                {"bytes": file, "path": f"frame-{k:06d}.png"} for k, file in enumerate(files)
             ]
-            size += sum(len(one["bytes"]) for one in columns[name])
-        if self._frames_waiting and (
-            self._frames_waiting + count > _ROWS or self._bytes + size > _IMAGES
-        ):
+            byte_count += sum(len(file) for file in files)
+        has_many_frames = self._pending_frames + count > _ROWS
+        has_many_bytes = self._pending_bytes + byte_count > _IMAGES
+        if self._pending_frames and (has_many_frames or has_many_bytes):
             self._flush()
+        row = {
+            "episode_index": number,
+            "tasks": [task],
+            "length": count,
+            "data/chunk_index": self.file_count // _CHUNK,
+            "data/file_index": self.file_count % _CHUNK,
+            "dataset_from_index": self.frame_count,
+            "dataset_to_index": self.frame_count + count,
+            "meta/episodes/chunk_index": 0,
+            "meta/episodes/file_index": 0,
+        }
+        for name, own in stats.items():
+            for key, value in own.items():
+                row[f"stats/{name}/{key}"] = value.tolist()
+        self.rows.append(row)
         self.stats.append(stats)
-        self.rows.append(
-            {
-                "episode_index": number,
-                "tasks": [describe_task(episode.about)],
-                "length": count,
-                "data/chunk_index": self.count // _CHUNK,
-                "data/file_index": self.count % _CHUNK,
-                "dataset_from_index": self.frames,
-                "dataset_to_index": self.frames + count,
-                "meta/episodes/chunk_index": 0,
-                "meta/episodes/file_index": 0,
-                **{
-                    f"stats/{name}/{key}": value.tolist()
-                    for name, own in stats.items()
-                    for key, value in own.items()
-                },
-            }
-        )
-        self._waiting.append(columns)
-        self._frames_waiting += count
-        self._bytes += size
-        self.frames += count
+        self._pending.append(columns)
+        self._pending_frames += count
+        self._pending_bytes += byte_count
+        self.frame_count += count
 
     def _flush(self) -> None:
         """Write pending frames to a file with one row group per episode."""
         arrow = self.arrow
-        place = {"chunk_index": self.count // _CHUNK, "file_index": self.count % _CHUNK}
-        fields: list[Any] = []
-        for name, feature in self.features.items():
-            kind = arrow.float32() if feature["dtype"] == "float32" else arrow.int64()
-            if feature["dtype"] == "image":
-                kind = arrow.struct([("bytes", arrow.binary()), ("path", arrow.string())])
-            elif feature["shape"] != [1]:
-                kind = arrow.list_(kind, feature["shape"][0])
-            fields.append((name, kind))
+        fields = [(name, self._choose_type(feature)) for name, feature in self.features.items()]
         described = {"info": {"features": self._describe_features()}}
         schema = arrow.schema(fields, metadata={_SCHEMA_KEY: json.dumps(described)})
-        tables = []
-        for columns in self._waiting:
-            arrays = []
-            for name, kind in fields:
-                values = columns[name]
-                if isinstance(values, list):
-                    arrays.append(arrow.array(values, kind))
-                    continue
-                flat = arrow.array(values.reshape(-1))
-                rows = arrow.FixedSizeListArray.from_arrays
-                arrays.append(flat if values.ndim == 1 else rows(flat, type=kind))
+        tables: list[Any] = []
+        for columns in self._pending:
+            arrays = [self._make_array(columns[name], kind) for name, kind in fields]
             tables.append(arrow.Table.from_arrays(arrays, schema=schema))
-        self._write_tables(self.folder / _DATA.format(**place), tables)
-        self._waiting, self._frames_waiting, self._bytes, self.count = [], 0, 0, self.count + 1
+        path = _DATA.format(
+            chunk_index=self.file_count // _CHUNK, file_index=self.file_count % _CHUNK
+        )
+        self._write_tables(self.folder / path, tables)
+        self.file_count += 1
+        self._pending = []
+        self._pending_frames = 0
+        self._pending_bytes = 0
+
+    def _choose_type(self, feature: Mapping[str, Any]) -> Any:
+        """Return the type of a feature in Parquet files."""
+        arrow = self.arrow
+        if feature["dtype"] == "image":
+            return arrow.struct([("bytes", arrow.binary()), ("path", arrow.string())])
+        kind = arrow.float32() if feature["dtype"] == "float32" else arrow.int64()
+        if feature["shape"] == [1]:
+            return kind
+        return arrow.list_(kind, feature["shape"][0])
+
+    def _make_array(self, values: Any, kind: Any) -> Any:
+        """Return a column for Parquet files from numbers, shape (N,) or (N, n), or images."""
+        arrow = self.arrow
+        if isinstance(values, list):
+            return arrow.array(values, kind)
+        flat = arrow.array(values.reshape(-1))
+        if values.ndim == 1:
+            return flat
+        return arrow.FixedSizeListArray.from_arrays(flat, type=kind)
 
     def _describe_features(self) -> dict[str, Any]:
         """Describe the columns as the package `datasets` does: readers then decode images."""
@@ -266,8 +282,9 @@ class _Writer:
 
     def _close(self) -> None:
         """Write pending frames, tables and statistics."""
-        arrow, meta = self.arrow, self.folder / "meta"
-        if self._waiting:
+        arrow = self.arrow
+        meta = self.folder / "meta"
+        if self._pending:
             self._flush()
         path = self.folder / _EPISODES.format(chunk_index=0, file_index=0)
         self._write_tables(path, [arrow.Table.from_pylist(self.rows)])
@@ -281,7 +298,7 @@ class _Writer:
             "codebase_version": VERSION,
             "robot_type": self.robot.name,
             "total_episodes": len(self.rows),
-            "total_frames": self.frames,
+            "total_frames": self.frame_count,
             "total_tasks": len(self.tasks),
             "chunks_size": _CHUNK,
             "data_files_size_in_mb": _SIZE,
@@ -292,11 +309,11 @@ class _Writer:
             "video_path": None,
             "features": self.features,
         }
-        stats = {
-            name: _merge_statistics([own[name] for own in self.stats]) for name in self.features
-        }
-        for name, content in (("info", info), ("stats", stats)):
-            self._write_json(meta / f"{name}.json", content)
+        stats: dict[str, dict[str, list[float]]] = {}
+        for name in self.features:
+            stats[name] = _merge_statistics([own[name] for own in self.stats])
+        self._write_json(meta / "info.json", info)
+        self._write_json(meta / "stats.json", stats)
 
 
 class _Comparison(_Writer):
@@ -318,70 +335,85 @@ class _Comparison(_Writer):
         self.files.append(path)
         stored = parse_json(read_text(path, "JSON"), path)
         if path.name == "stats.json" and not _has_quantiles(stored):
-            content = {
-                name: {key: value for key, value in own.items() if key not in _QUANTILES}
-                for name, own in content.items()
-            }
+            content = {name: _drop_quantiles(own) for name, own in content.items()}
         self._compare(path, "", stored, content)
 
     def _write_tables(self, path: Path, tables: Sequence[Any]) -> None:
         self.files.append(path)
         if not path.is_file() or path.is_symlink():
             raise InputError("there is no such file", file=path, expected="a file of the dataset")
-        parquet, arrow = self.arrow.parquet, self.arrow
         try:
-            with parquet.ParquetFile(path) as file:
-                groups = [file.metadata.row_group(k).num_rows for k in range(file.num_row_groups)]
-                sizes = [table.num_rows for table in tables]
-                names = file.schema_arrow.names
-                if not any(map(_is_quantile, names)):
-                    kept = [name for name in tables[0].column_names if not _is_quantile(name)]
-                    tables = [table.select(kept) for table in tables]
-                if groups != sizes or not file.schema_arrow.equals(tables[0].schema):
-                    raise InputError(
-                        "other columns or sizes",
-                        file=path,
-                        expected=f"row groups of {sizes} with {tables[0].schema.names}",
-                        got=f"{groups[:100]} with {names[:100]}",
-                    )
-                self._compare_descriptions(path, file.schema_arrow, tables[0].schema)
-                for k, table in enumerate(tables):
-                    stored = file.read_row_group(k)
-                    for name in table.column_names:
-                        column, truth = stored[name], table[name]
-                        if not column.equals(truth):
-                            where = f"row group {k}: {name}"
-                            statistics = table.to_pydict() if _is_quantile(name) else {}
-                            tolerance = _choose_tolerance(name, statistics)
-                            self._compare(
-                                path, where, column.to_pylist(), truth.to_pylist(), tolerance
-                            )
-        except (arrow.ArrowException, OSError, MemoryError) as error:
-            problem, expected = "not a Parquet file, or a damaged one", "a file of the dataset"
-            raise InputError(problem, file=path, expected=expected, got=str(error)) from error
+            with self.arrow.parquet.ParquetFile(path) as file:
+                self._compare_tables(path, file, tables)
+        except (self.arrow.ArrowException, OSError, MemoryError) as error:
+            raise InputError(
+                "not a Parquet file, or a damaged one",
+                file=path,
+                expected="a file of the dataset",
+                got=str(error),
+            ) from error
+
+    def _compare_tables(self, path: Path, file: Any, tables: Sequence[Any]) -> None:
+        """Compare the row groups of a Parquet file with tables."""
+        groups = [file.metadata.row_group(k).num_rows for k in range(file.num_row_groups)]
+        sizes = [table.num_rows for table in tables]
+        names = file.schema_arrow.names
+        if not any(_is_quantile(name) for name in names):
+            kept = [name for name in tables[0].column_names if not _is_quantile(name)]
+            tables = [table.select(kept) for table in tables]
+        schema = tables[0].schema
+        if groups != sizes or not file.schema_arrow.equals(schema):
+            raise InputError(
+                "other columns or sizes",
+                file=path,
+                expected=f"row groups of {sizes} with {schema.names}",
+                got=f"{groups[:100]} with {names[:100]}",
+            )
+        self._compare_descriptions(path, file.schema_arrow, schema)
+        for k, table in enumerate(tables):
+            stored = file.read_row_group(k)
+            for name in table.column_names:
+                column = stored[name]
+                truth = table[name]
+                if column.equals(truth):
+                    continue
+                statistics = table.to_pydict() if _is_quantile(name) else {}
+                tolerance = _choose_tolerance(name, statistics)
+                where = f"row group {k}: {name}"
+                self._compare(path, where, column.to_pylist(), truth.to_pylist(), tolerance)
 
     def _compare_descriptions(self, path: Path, stored: Any, truth: Any) -> None:
         """Compare what the schemas of a file say about columns, if both say anything."""
         key = _SCHEMA_KEY.encode()
-        metadata = [schema.metadata or {} for schema in (stored, truth)]
-        if all(key in one for one in metadata):
-            texts = [one[key].decode(errors="replace") for one in metadata]
-            described, expected = (parse_json(text, path) for text in texts)
+        stored_metadata = stored.metadata or {}
+        true_metadata = truth.metadata or {}
+        if key in stored_metadata and key in true_metadata:
+            described = parse_json(stored_metadata[key].decode(errors="replace"), path)
+            expected = parse_json(true_metadata[key].decode(errors="replace"), path)
             self._compare(path, _SCHEMA_KEY, described, expected)
 
     def _compare(
         self, path: Path, where: str, stored: Any, truth: Any, tolerance: float = _TOLERANCE
     ) -> None:
         """Record the first difference of plain data, numbers up to a tolerance."""
-        if difference := _find_difference(stored, truth, tolerance):
-            name = path.relative_to(self.folder)
-            self.found.append(": ".join(part for part in (str(name), where, difference) if part))
+        difference = _find_difference(stored, truth, tolerance)
+        if difference:
+            name = str(path.relative_to(self.folder))
+            parts = [name, where, difference] if where else [name, difference]
+            self.found.append(": ".join(parts))
 
 
 def _has_quantiles(stored: Any) -> bool:
     """Return whether the content of stats.json has a quantile of any feature."""
-    features = stored.values() if isinstance(stored, dict) else ()
-    return any(not _QUANTILES.keys().isdisjoint(own) for own in features if isinstance(own, dict))
+    if not isinstance(stored, dict):
+        return False
+    features = [own for own in stored.values() if isinstance(own, dict)]
+    return any(not _QUANTILES.keys().isdisjoint(own) for own in features)
+
+
+def _drop_quantiles(statistics: Mapping[str, Any]) -> dict[str, Any]:
+    """Return statistics without quantiles."""
+    return {key: value for key, value in statistics.items() if key not in _QUANTILES}
 
 
 def _choose_tolerance(name: str, statistics: Mapping[str, Any]) -> float:
@@ -392,8 +424,8 @@ def _choose_tolerance(name: str, statistics: Mapping[str, Any]) -> float:
     if not _is_quantile(name):
         return _TOLERANCE
     begin = name.removesuffix(name.rpartition("/")[2])
-    low, high = (np.array(statistics[begin + end]) for end in ("min", "max"))
-    return _TOLERANCE + 2.0 / _BINS * float(np.max(high - low))
+    span = np.array(statistics[f"{begin}max"]) - np.array(statistics[f"{begin}min"])
+    return _TOLERANCE + 2.0 / _BINS * float(np.max(span))
 
 
 def _find_difference(stored: Any, truth: Any, tolerance: float = _TOLERANCE) -> str:
@@ -401,16 +433,22 @@ def _find_difference(stored: Any, truth: Any, tolerance: float = _TOLERANCE) -> 
     if isinstance(truth, dict) and isinstance(stored, dict):
         if set(stored) != set(truth):
             return f"the fields {format_value(list(stored))}, not {format_value(list(truth))}"
-        pairs = [(stored[name], truth[name], _choose_tolerance(name, truth)) for name in truth]
-    elif isinstance(truth, list) and isinstance(stored, list):
+        for name, value in truth.items():
+            difference = _find_difference(stored[name], value, _choose_tolerance(name, truth))
+            if difference:
+                return difference
+        return ""
+    if isinstance(truth, list) and isinstance(stored, list):
         if len(stored) != len(truth):
             return f"{len(stored)} entries, not {len(truth)}"
-        pairs = [(*pair, tolerance) for pair in zip(stored, truth, strict=True)]
-    elif _agrees(stored, truth, tolerance):
+        for stored_value, value in zip(stored, truth, strict=True):
+            difference = _find_difference(stored_value, value, tolerance)
+            if difference:
+                return difference
         return ""
-    else:
-        return f"{format_value(stored)}, not {truth!r:.300}"
-    return next(filter(None, (_find_difference(*pair) for pair in pairs)), "")
+    if _agrees(stored, truth, tolerance):
+        return ""
+    return f"{format_value(stored)}, not {truth!r:.300}"
 
 
 def _agrees(stored: Any, truth: Any, tolerance: float) -> bool:
@@ -435,15 +473,18 @@ def _decode(image: bytes, like: bytes) -> bytes:
         return b""
 
 
-def _pictures(episode: Episode) -> Iterator[tuple[str, Any]]:
+def _iterate_images(episode: Episode) -> Iterator[tuple[str, Any]]:
     """Yield the feature name and images of each camera, shape (N, height, width, 3)."""
     images = episode.images()
-    for name, pixels in {} if images is None else images.pictures.items():
-        if name.endswith(_SEEN):
-            yield f"observation.images.{name.removesuffix(_SEEN)}", pixels
+    if images is None:
+        return
+    for name, pixels in images.pictures.items():
+        if name.endswith(_IMAGE_SUFFIX):
+            yield f"observation.images.{name.removesuffix(_IMAGE_SUFFIX)}", pixels
 
 
-def _png(pixels: Any) -> bytes:
+def _encode_png(pixels: Any) -> bytes:
+    """Return an image as a PNG file."""
     from PIL import Image
 
     buffer = io.BytesIO()
@@ -464,21 +505,30 @@ def _describe_images(pixels: Any) -> dict[str, Floats]:
     Args:
         pixels: Images, shape (N, height, width, 3).
     """
-    colours = []
+    colours: list[dict[str, float]] = []
     for colour in np.moveaxis(pixels, -1, 0):
         weights = np.bincount(colour.ravel(), minlength=256)
         levels = np.flatnonzero(weights).astype(np.uint8)
         colours.append(_describe_values(levels, weights[levels]))
     found = _collect(colours, len(pixels))
     scaled = {name: value.reshape(-1, 1, 1) / 255.0 for name, value in found.items()}
-    return {**scaled, "count": found["count"]}
+    scaled["count"] = found["count"]
+    return scaled
 
 
 def _collect(columns: Sequence[Mapping[str, float]], count: int) -> dict[str, Floats]:
     """Return name → values of all columns, in the order of LeRobot's tables."""
-    found = {name: np.array([column[name] for column in columns]) for name in columns[0]}
-    quantiles = {name: found.pop(name) for name in _QUANTILES}
-    return {**found, "count": np.array([count]), **quantiles}
+    found: dict[str, Floats] = {}
+    quantiles: dict[str, Floats] = {}
+    for name in columns[0]:
+        values = np.array([column[name] for column in columns])
+        if name in _QUANTILES:
+            quantiles[name] = values
+        else:
+            found[name] = values
+    found["count"] = np.array([count])
+    found.update(quantiles)
+    return found
 
 
 def _describe_values(values: Any, weights: Any) -> dict[str, float]:
@@ -502,9 +552,9 @@ def _describe_values(values: Any, weights: Any) -> dict[str, float]:
     for name, fraction in _QUANTILES.items():
         target = fraction * sums[-1]
         k = int(np.searchsorted(sums, target))
-        part = (target - sums[k] + counts[k]) / counts[k]
         # LeRobot takes the lower edge if the value is in the first bin.
-        found[name] = edges[k] + (part if k > 0 else 0.0) * (edges[k + 1] - edges[k])
+        part = (target - sums[k] + counts[k]) / counts[k] if k > 0 else 0.0
+        found[name] = edges[k] + part * (edges[k + 1] - edges[k])
     return found
 
 
@@ -518,16 +568,19 @@ _PANDAS = {
     "column_indexes": [],
     "columns": [
         {
-            "name": name,
-            "field_name": name,
-            "pandas_type": pandas_type,
-            "numpy_type": numpy_type,
+            "name": "task_index",
+            "field_name": "task_index",
+            "pandas_type": "int64",
+            "numpy_type": "int64",
             "metadata": None,
-        }
-        for name, pandas_type, numpy_type in (
-            ("task_index", "int64", "int64"),
-            ("task", "unicode", "object"),
-        )
+        },
+        {
+            "name": "task",
+            "field_name": "task",
+            "pandas_type": "unicode",
+            "numpy_type": "object",
+            "metadata": None,
+        },
     ],
     "pandas_version": "2.0.0",
 }
@@ -535,10 +588,15 @@ _PANDAS = {
 
 
 def _merge_statistics(parts: list[dict[str, Floats]]) -> dict[str, list[float]]:
-    """Merge the statistics of parts."""
+    """Merge the statistics of parts.
+
+    With n_i values of mean m_i and deviation s_i in part i, and n in all, the mean is
+    m = Σ n_i m_i / n and the variance Σ n_i (s_i² + (m_i − m)²) / n.
+    """
+    means = np.array([part["mean"] for part in parts])
+    deviations = np.array([part["std"] for part in parts])
     counts = np.array([part["count"][0] for part in parts], float)
-    counts = counts.reshape(-1, *[1] * parts[0]["mean"].ndim)
-    means, deviations = (np.array([part[name] for part in parts]) for name in ("mean", "std"))
+    counts = counts.reshape(-1, *([1] * (means.ndim - 1)))
     total = counts.sum()  # images of a camera have one size: frames weigh as pixels do
     mean = (means * counts).sum(axis=0) / total
     variance = ((deviations**2 + (means - mean) ** 2) * counts).sum(axis=0) / total

@@ -29,40 +29,42 @@ def sample_episode(episode: Episode, robot: Robot, rate: float) -> Mapping[str, 
         at the next sample (N, n + 1).
     """
     motion = episode.trajectory
+    size = motion.robot_size
     times = sample_times(motion, rate)
-    positions, velocities, size = motion.at(times), motion.velocity(times), motion.robot_size
-    phase = np.clip(
-        np.searchsorted(motion.times[[p.last for p in motion.phases]], times),
-        0,
-        len(motion.phases) - 1,
-    )
-    openings = np.array([np.nan if p.opening is None else p.opening for p in motion.phases])
-    gripper = np.nan_to_num(openings[phase])[:, None]
-    holding = np.array([float(bool(p.holds)) for p in motion.phases])[phase][:, None]
-    told = np.hstack([positions[:, :size], gripper])
+    positions = motion.at(times)
+    velocities = motion.velocity(times)
+    ends = motion.times[[phase.last for phase in motion.phases]]
+    phases = np.clip(np.searchsorted(ends, times), 0, len(motion.phases) - 1)
+    openings = [0.0 if phase.opening is None else phase.opening for phase in motion.phases]
+    gripper = np.array(openings)[phases][:, None]
+    is_holding = [float(bool(phase.holds)) for phase in motion.phases]
+    holding = np.array(is_holding)[phases][:, None]
+    commanded = np.hstack([positions[:, :size], gripper])
     return {
         "time": times,
         "base_pose": positions[:, :3],
         "base_velocity": velocities[:, :3],
         "arm_position": positions[:, 3:size],
         "arm_velocity": velocities[:, 3:size],
-        "hand_pose": _hands(robot, positions[:, :size]),
+        "hand_pose": _compute_hand_poses(robot, positions[:, :size]),
         "gripper": gripper,
         "holding": holding,
         "object_position": positions[:, size:],
         "states": positions,
-        "actions": np.vstack([told[1:], told[-1:]]),
+        "actions": np.vstack([commanded[1:], commanded[-1:]]),
     }
 
 
-def _hands(robot: Robot, configurations: Floats) -> Floats:
+def _compute_hand_poses(robot: Robot, configurations: Floats) -> Floats:
     """Return poses of the tool frame without sign changes of the quaternion, shape (N, 7)."""
-    data, frame = robot.model.createData(), robot.model.getFrameId(robot.tool_frame)
+    data = robot.model.createData()
+    frame = robot.model.getFrameId(robot.tool_frame)
     rows = np.empty((len(configurations), 7))
     for row, configuration in zip(rows, configurations, strict=True):
         pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(configuration))
         row[:] = pin.SE3ToXYZQUAT(data.oMf[frame])
     # q and -q are the same rotation: signs are chosen such that none jumps.
-    turns = np.sign(np.einsum("ij,ij->i", rows[1:, 3:], rows[:-1, 3:]))
-    rows[1:, 3:] *= np.cumprod(np.where(turns == 0.0, 1.0, turns))[:, None]
+    signs = np.sign(np.einsum("ij,ij->i", rows[1:, 3:], rows[:-1, 3:]))
+    signs[signs == 0.0] = 1.0
+    rows[1:, 3:] *= np.cumprod(signs)[:, None]
     return rows

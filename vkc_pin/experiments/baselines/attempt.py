@@ -44,7 +44,9 @@ BaselineStep = Actuate | Place | GoTo | Reach
 
 FINER = 2
 """Factor of `Options.move_waypoints` for moving objects, since the arm only follows."""
-_STANDS, _ENDS = 4, 10  # numbers of base poses that are tried at the handle and at the end
+# numbers of base poses that are tried at the handle and at the end
+_HANDLE_POSES = 4
+_END_POSES = 10
 _BASE = slice(3)
 
 
@@ -65,38 +67,44 @@ class Attempt:
         finer: int,
         cache: Cache,
     ) -> None:
-        self.scene, self.options, self.refine, self.finer = scene, options, refine, finer
+        self.scene = scene
+        self.options = options
+        self.refine = refine
+        self.finer = finer
+        self.cache = cache
         self.rng = np.random.default_rng(seed)
         self.parts: list[Trajectory] = []
         self.times = dict.fromkeys([*STAGES, "following"], 0.0)
-        self.iterations, self.cache = 0, cache
+        self.iterations = 0
 
     def run(self, steps: Sequence[BaselineStep]) -> tuple[Trajectory, float, str]:
         """Return the motion, the number of completed stages (infinite: all), and the cause."""
+        pause = self.options.grasp_time
         try:
             for step in steps:
-                if isinstance(step, Actuate):
-                    self._actuate(step)
-                elif isinstance(step, Place):
-                    self._place(step)
-                elif isinstance(step, Reach):
-                    self._drive_and_reach([step], self._poses(self._problem([step])), _STANDS)
-                else:  # without a goal heading, the best one
-                    goals = find_goal_poses(step, float(self.scene.start[2]))
-                    self._do_withdrawn(
-                        functools.partial(self._drive, goals), FailedError("no base path")
-                    )
+                self._do_step(step)
         except (FailedError, BudgetExhaustedError) as error:
             failure = error if isinstance(error, FailedError) else FailedError(str(error))
-            parts = [*self.parts, *failure.parts] or [
-                make_stationary_trajectory(self.scene, self.options)
-            ]
-            return (
-                concatenate_trajectories(parts, pause=self.options.grasp_time),
-                len(self.parts) + failure.progress,
-                failure.cause,
-            )
-        return concatenate_trajectories(self.parts, pause=self.options.grasp_time), np.inf, ""
+            progress = len(self.parts) + failure.progress
+            parts = [*self.parts, *failure.parts]
+            if not parts:
+                parts = [make_stationary_trajectory(self.scene, self.options)]
+            return concatenate_trajectories(parts, pause=pause), progress, failure.cause
+        return concatenate_trajectories(self.parts, pause=pause), np.inf, ""
+
+    def _do_step(self, step: BaselineStep) -> None:
+        """Carry out a step, stage by stage."""
+        if isinstance(step, Actuate):
+            self._actuate(step)
+        elif isinstance(step, Place):
+            self._place(step)
+        elif isinstance(step, Reach):
+            poses = self._find_poses(self._make_problem([step]))
+            self._drive_and_reach([step], poses, _HANDLE_POSES)
+        else:  # without a goal heading, the best one
+            goals = find_goal_poses(step, float(self.scene.start[2]))
+            drive = functools.partial(self._drive, goals)
+            self._do_withdrawn(drive, FailedError("no base path"))
 
     def _actuate(self, step: Actuate) -> None:
         """Drive to an object's handle, grasp it unless it is grasped, and move the joints."""
@@ -110,13 +118,13 @@ class Attempt:
         """Grasp an object unless it is grasped, carry it to a base pose, and put it down."""
         if step.object not in self.scene.held:
             self._grasp([Grasp(step.object, step.attachment)])
-        poses = self._poses(self._problem([step]))
-        self._drive_and_reach([step], poses, _ENDS)
+        poses = self._find_poses(self._make_problem([step]))
+        self._drive_and_reach([step], poses, _END_POSES)
 
     def _grasp(self, steps: Sequence[Step]) -> None:
         """Drive to the nearest base pose from which the arm reaches the grasp, and grasp."""
-        poses = self._poses(self._problem(steps, scene=self.scene.with_held({})))
-        self._drive_and_reach(steps, poses, _STANDS)
+        poses = self._find_poses(self._make_problem(steps, scene=self.scene.with_held({})))
+        self._drive_and_reach(steps, poses, _HANDLE_POSES)
 
     def _drive_and_reach(self, steps: Sequence[Step], poses: Floats, most: int) -> None:
         """Drive to one of the first `most` base poses, shape (K, n), and reach from there."""
@@ -126,9 +134,8 @@ class Attempt:
             self._reach(steps, pose)
 
         def try_poses() -> None:
-            self._try_choices(
-                self._free(poses)[:most], drive_and_reach, FailedError("no base pose", share=-1.0)
-            )
+            failure = FailedError("no base pose", share=-1.0)
+            self._try_choices(self._select_free(poses)[:most], drive_and_reach, failure)
 
         self._do_withdrawn(try_poses, FailedError("no base pose", share=-1.0))
 
@@ -139,13 +146,15 @@ class Attempt:
             self._withdraw(path)
             stage()
 
-        self._try_choices(generate_postures(self._problem([self._here()])), withdraw, failure)
+        postures = generate_postures(self._make_problem([self._stay()]))
+        self._try_choices(postures, withdraw, failure)
 
     def _try_choices(
         self, choices: Iterable[Floats], stage: Callable[[Floats], None], failure: FailedError
     ) -> None:
         """Do a stage with the first choice that works, or raise the failure with most progress."""
-        scene, before = self.scene, self.parts
+        scene = self.scene
+        before = self.parts
         for choice in choices:
             self.parts = list(before)
             try:
@@ -153,11 +162,13 @@ class Attempt:
                 return
             except FailedError as error:
                 error.parts = [*self.parts[len(before) :], *error.parts]
-                failure = max(failure, error, key=lambda one: one.progress)
-                self.scene, self.parts = scene, before
+                if error.progress > failure.progress:
+                    failure = error
+                self.scene = scene
+                self.parts = before
         raise failure
 
-    def _poses(self, problem: TrajectoryProblem) -> Floats:
+    def _find_poses(self, problem: TrajectoryProblem) -> Floats:
         """Return configurations for the end of a problem, the nearest first."""
         began = time.perf_counter()
         poses = find_base_poses(problem, problem.segments, problem.start, self.rng)
@@ -166,72 +177,67 @@ class Attempt:
             raise FailedError("no base pose")
         return poses
 
-    def _free(self, poses: Floats) -> Floats:
+    def _select_free(self, poses: Floats) -> Floats:
         """Return the poses at which the base is free with the present arm."""
-        stay = self._problem([self._here()])
-        ends = np.tile(stay.start, (len(poses) + 1, 1))
+        problem = self._make_problem([self._stay()])
+        # The base at all poses, and where it is.
+        ends = np.tile(problem.start, (len(poses) + 1, 1))
         ends[:-1, :3] = poses[:, :3]
-        depth = KeyframeSampler(stay, self.rng).compute_shortfall(ends, stay.segments)
+        sampler = KeyframeSampler(problem, self.rng)
+        shortfalls = sampler.compute_shortfall(ends, problem.segments)
         # The arm may stay as close to the robot as it is.
-        return np.asarray(poses[depth[:-1] <= min(depth[-1], CLEARANCE_TOLERANCE)])
+        accepted = min(shortfalls[-1], CLEARANCE_TOLERANCE)
+        return np.asarray(poses[shortfalls[:-1] <= accepted])
 
     def _withdraw(self, path: Floats) -> None:
         """Move the arm along configurations, shape (K, n), while the base is stationary."""
         if not len(path):
             return
-        problem = _fix_coordinates(self._problem([self._here()]), _BASE)
+        problem = _fix_coordinates(self._make_problem([self._stay()]), _BASE)
         arm = slice(3, problem.chain.robot.coordinates.size)
         problem = _fix_coordinates(problem, arm, path[-1, arm], rows=-1)
-        guesses = [
-            InitialGuess("straight", interpolate_path(problem, path[k:]))
-            for k in (0, -1)[: len(path)]
-        ]
+        guesses = [InitialGuess("straight", interpolate_path(problem, path))]
+        if len(path) > 1:
+            guesses.append(InitialGuess("straight", interpolate_path(problem, path[-1:])))
         self._append(problem, *self._solve(problem, iter(guesses), "arm does not reach"))
 
     def _drive(self, goals: Floats) -> None:
         """Drive to one of several poses, shape (G, 3), with the arm as it is."""
         x, y, yaw = goals[0].tolist()
-        problem = self._problem([GoTo(x, y, yaw if len(goals) == 1 else None)])
+        has_heading = len(goals) == 1
+        problem = self._make_problem([GoTo(x, y, yaw if has_heading else None)])
         problem = _fix_coordinates(problem, slice(3, problem.chain.robot.coordinates.size))
-        bare = is_at_home(problem) and not self.scene.held and len(goals) == 1
-        guesses = (
-            initialize(problem, "astar", self._draw_seed())
-            if bare
-            else BasePaths(problem, whole=True).make_guesses(problem, goals)
-        )
+        if is_at_home(problem) and not self.scene.held and has_heading:
+            guesses = initialize(problem, "astar", self._draw_seed())
+        else:
+            guesses = BasePaths(problem, whole=True).make_guesses(problem, goals)
         self._append(problem, *self._solve(problem, guesses, "no base path"))
 
     def _reach(self, steps: Sequence[Step], pose: Floats) -> None:
         """Grasp the object or put it down, while the base is stationary."""
-        problem = _fix_coordinates(self._problem(steps), _BASE)
+        problem = _fix_coordinates(self._make_problem(steps), _BASE)
         last = np.append(problem.start[:3], pose[3:])
-        guesses = [
-            InitialGuess(
-                "straight",
-                problem.start
-                + sample_smoothstep(problem.segments)[:, None] * (last - problem.start),
-            )
-        ]
+        fractions = sample_smoothstep(problem.segments)[:, None]
+        straight = problem.start + fractions * (last - problem.start)
+        guesses = [InitialGuess("straight", straight)]
         phase = problem.task.phases[-1]
-        if phase.lowered:  # from above
-            above = ApproachPaths(KeyframeSampler(problem, self.rng)).find_release_retreat(
-                last, phase
-            )[::-1]
-            guesses = [
-                InitialGuess("from above", interpolate_path(problem, np.vstack([above, last])))
-            ] * (len(above) > 0) + guesses
+        if phase.lowered:
+            approach = ApproachPaths(KeyframeSampler(problem, self.rng))
+            above = approach.find_release_retreat(last, phase)[::-1]
+            if len(above):
+                lowering = interpolate_path(problem, np.vstack([above, last]))
+                guesses.insert(0, InitialGuess("from above", lowering))
         more = initialize(problem, "interpolated", self._draw_seed())
-        self._append(
-            problem, *self._solve(problem, itertools.chain(guesses, more), "arm does not reach")
-        )
+        all_guesses = itertools.chain(guesses, more)
+        self._append(problem, *self._solve(problem, all_guesses, "arm does not reach"))
 
     def _move(self, step: Actuate) -> None:
         """Move the object's joints; the base drives to the nearest pose that suits the arm."""
-        problem = self._problem(
-            [step], replace(self.options, move_waypoints=self.finer * self.options.move_waypoints)
-        )
-        paths, failure = BasePaths(problem), FailedError("no base path")
-        for pose in self._poses(problem)[:_ENDS]:
+        waypoints = self.finer * self.options.move_waypoints
+        problem = self._make_problem([step], replace(self.options, move_waypoints=waypoints))
+        paths = BasePaths(problem)
+        failure = FailedError("no base path")
+        for pose in self._find_poses(problem)[:_END_POSES]:
             base = paths.find_base_path(problem, pose[:3])
             if base is None:
                 continue
@@ -249,21 +255,22 @@ class Attempt:
                 self._append(problem, followed.z, timing.dt)
                 return
             if not failure.parts or followed.share > failure.share:
-                failure = FailedError(
-                    cause, make_trajectory(problem, followed.z, timing.dt), followed.share
-                )
+                motion = make_trajectory(problem, followed.z, timing.dt)
+                failure = FailedError(cause, motion, followed.share)
         raise failure
 
-    def _here(self) -> GoTo:
+    def _stay(self) -> GoTo:
+        """Return the step that keeps the base where it is."""
         return GoTo(*self.scene.start[:3].tolist())
 
-    def _problem(
+    def _make_problem(
         self, steps: Sequence[Step], options: Options | None = None, scene: Scene | None = None
     ) -> TrajectoryProblem:
-        options, scene = options or self.options, scene or self.scene
-        return TrajectoryProblem(
-            scene, compile_task(scene, steps, options), options, cache=self.cache
-        )
+        """Make the problem of some steps from the present scene."""
+        options = options or self.options
+        scene = scene or self.scene
+        task = compile_task(scene, steps, options)
+        return TrajectoryProblem(scene, task, options, cache=self.cache)
 
     def _solve(
         self, problem: TrajectoryProblem, guesses: Iterator[InitialGuess], cause: str
@@ -283,8 +290,10 @@ class Attempt:
         raise failure
 
     def _append(self, problem: TrajectoryProblem, z: Floats, dt: Floats) -> None:
-        self.parts.append(make_trajectory(problem, z, dt))
-        self.scene = compute_final_scene(self.scene, self.parts[-1], problem.task.after)
+        """Append the motion of a stage, and continue from its end."""
+        part = make_trajectory(problem, z, dt)
+        self.parts.append(part)
+        self.scene = compute_final_scene(self.scene, part, problem.task.after)
 
     def _draw_seed(self) -> int:
         return int(self.rng.integers(2**32))
@@ -297,8 +306,10 @@ def _fix_coordinates(
     rows: slice | int = slice(None),
 ) -> TrajectoryProblem:
     """Return a problem in which coordinates are fixed, to their start by default."""
-    lower, upper = problem.lower.copy(), problem.upper.copy()
-    lower[rows, columns] = upper[rows, columns] = (
-        problem.start[columns] if values is None else values
-    )
+    if values is None:
+        values = problem.start[columns]
+    lower = problem.lower.copy()
+    upper = problem.upper.copy()
+    lower[rows, columns] = values
+    upper[rows, columns] = values
     return problem.with_bounds(lower, upper)

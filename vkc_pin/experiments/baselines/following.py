@@ -24,20 +24,28 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 
 QP = "daqp"
 """Solver of quadratic programs, by its name in `qpsolvers`."""
+# iterations of inverse kinematics
 _ITERATIONS = 30
 _FRAME = "closure"
 CLEAR = CLEARANCE_TOLERANCE
 """Accepted shortfall of clearances [m], as in the solver."""
+# rounds of refinement
 _ROUNDS = 12
-_REACH = 0.05  # distance beyond the clearance up to which contacts are considered [m]
-_LONGEST = 0.2  # largest step of a coordinate in one round [m] or [rad]
-_OBJECT = 10.0  # weight of the object's deviation from its time law; that of the arm is 1
-_SLACK = 1e3  # weight of the slack
-_REGULAR = 1e-6  # makes the program strictly convex in the slack
+# [m] distance beyond the clearance up to which contacts are considered
+_REACH = 0.05
+# [m] or [rad] largest step of a coordinate in one round
+_MAX_ROUND_STEP = 0.2
+# weight of the object's deviation from its time law; that of the arm is 1
+_OBJECT_WEIGHT = 10.0
+_SLACK_WEIGHT = 1e3
+# makes the program strictly convex in the slack
+_SLACK_CURVATURE = 1e-6
 SEEDS = 16
 """Number of random arms for inverse kinematics where it fails from the waypoint before."""
-_CAUSES = ("", "collision", "no inverse kinematics")  # the best first
-_SPREAD = 1.0  # of half of the random arms around the waypoint before [rad]; others: anywhere
+# the best first
+_CAUSES = ("", "collision", "no inverse kinematics")
+# [rad] of half of the random arms around the waypoint before; others: anywhere
+_SPREAD = 1.0
 
 
 def import_solvers() -> None:
@@ -58,10 +66,12 @@ class ArmKinematics:
     """
 
     def __init__(self, problem: TrajectoryProblem, sampler: KeyframeSampler) -> None:
-        self.problem, self.sampler = problem, sampler
-        chain = problem.chain
-        virtual = [chain.index(name) for names in chain.virtual.values() for name in names]
-        self.columns = np.array([*range(3, sampler.robot_size), *virtual], int)
+        self.problem = problem
+        self.sampler = sampler
+        columns = list(range(3, sampler.robot_size))
+        for names in problem.chain.virtual.values():
+            columns += [problem.chain.index(name) for name in names]
+        self.columns = np.array(columns, int)
         self._models: dict[int, pin.Model] = {}
 
     def solve(self, z: Floats, waypoint: int) -> tuple[Floats, bool]:
@@ -71,7 +81,8 @@ class ArmKinematics:
         pose = self.sampler.find_pose(waypoint)
         if pose is None:
             return z, True
-        model, chain = self._model(pose), self.problem.chain
+        chain = self.problem.chain
+        model = self._get_model(pose)
         task = pink.tasks.FrameTask(
             _FRAME, position_cost=1.0, orientation_cost=1.0, lm_damping=1e-3
         )
@@ -92,7 +103,7 @@ class ArmKinematics:
             configuration.update(chain.coordinates.q(box.z))
         return box.z, False
 
-    def _model(self, pose: int) -> pin.Model:
+    def _get_model(self, pose: int) -> pin.Model:
         """Return the chain's model with a frame for a pose constraint."""
         if pose not in self._models:
             row = self.problem.transcription.structure.poses[pose]
@@ -106,21 +117,26 @@ class _Box:
     """A limit for Pink: joint limits, bounded steps, and fixed coordinates except `columns`."""
 
     def __init__(self, columns: Ints, lower: Floats, upper: Floats, z: Floats) -> None:
-        self.columns, self.lower, self.upper, self.z = columns, lower, upper, z
+        self.columns = columns
+        self.lower = lower
+        self.upper = upper
+        self.z = z
         self._rows = np.vstack([np.eye(len(z)), -np.eye(len(z))])
 
     def take(self, step: Floats) -> None:
         """Take a step, shape (n,), without rounding errors of the solver in fixed coordinates."""
-        at, z = self.columns, self.z.copy()
-        z[at] = np.clip(z[at] + step[at], self.lower[at], self.upper[at])
+        columns = self.columns
+        z = self.z.copy()
+        z[columns] = np.clip(z[columns] + step[columns], self.lower[columns], self.upper[columns])
         self.z = z
 
     def compute_qp_inequalities(self, configuration: Any, dt: float) -> tuple[Floats, Floats]:
-        """Return G and h of G·δz ≤ h, shapes (2n, n) and (2n,)."""
-        most, least = np.zeros(len(self.z)), np.zeros(len(self.z))
-        at = self.columns
-        most[at] = np.clip(self.upper[at] - self.z[at], 0.0, MAX_STEP)
-        least[at] = np.clip(self.lower[at] - self.z[at], -MAX_STEP, 0.0)
+        """Return G and h of G·δz ≤ h, shapes (2n, n) and (2n,): δz ≤ most and −δz ≤ −least."""
+        columns = self.columns
+        most = np.zeros(len(self.z))
+        least = np.zeros(len(self.z))
+        most[columns] = np.clip(self.upper[columns] - self.z[columns], 0.0, MAX_STEP)
+        least[columns] = np.clip(self.lower[columns] - self.z[columns], -MAX_STEP, 0.0)
         return self._rows, np.concatenate([most, -least])
 
 
@@ -146,30 +162,34 @@ def refine_configuration(
     if pose is None:
         return z, True
     solver, target = sampler.get_pose_solver(pose)
-    lower, upper = problem.lower[waypoint - 1], problem.upper[waypoint - 1]
     free = np.concatenate([columns, sampler.object_columns])
-    weights = np.where(np.isin(free, columns), 1.0, _OBJECT)
+    lower = problem.lower[waypoint - 1][free]
+    upper = problem.upper[waypoint - 1][free]
+    weights = np.where(np.isin(free, columns), 1.0, _OBJECT_WEIGHT)
+    reach = problem.options.largest_margin + _REACH
     for _ in range(_ROUNDS):
-        residual, jacobian = (part[0] for part in solver.evaluate(z[None], target))
-        reach = problem.options.largest_margin + _REACH
+        residuals, jacobians = solver.evaluate(z[None], target)
+        residual = residuals[0]
+        jacobian = jacobians[0]
         contacts = problem.contacts.evaluate(
             z[None], np.array([waypoint]), reach=reach, nearest=None
         )
         if np.abs(residual).max() < TOLERANCE and contacts.compute_violation() <= CLEAR:
             return z, True
         gradients = problem.contacts.compute_gradients(z[None], contacts)[:, free]
-        room = contacts.distance - contacts.margin
-        bounds = [np.clip(limit[free] - z[free], -_LONGEST, _LONGEST) for limit in (lower, upper)]
+        clearances = contacts.distance - contacts.margin
+        least = np.clip(lower - z[free], -_MAX_ROUND_STEP, _MAX_ROUND_STEP)
+        most = np.clip(upper - z[free], -_MAX_ROUND_STEP, _MAX_ROUND_STEP)
         # The step of the free coordinates, then one slack for all pairs.
         step = qpsolvers.solve_qp(
-            np.diag([*weights, _REGULAR]),
-            np.append(weights * (z - wanted)[free], _SLACK),
-            np.column_stack([-gradients, -np.ones(len(room))]),
-            room,
-            np.column_stack([jacobian[:, free], np.zeros(len(residual))]),
-            -residual,
-            np.append(bounds[0], 0.0),
-            np.append(bounds[1], np.inf),
+            P=np.diag([*weights, _SLACK_CURVATURE]),
+            q=np.append(weights * (z - wanted)[free], _SLACK_WEIGHT),
+            G=np.column_stack([-gradients, -np.ones(len(clearances))]),
+            h=clearances,
+            A=np.column_stack([jacobian[:, free], np.zeros(len(residual))]),
+            b=-residual,
+            lb=np.append(least, 0.0),
+            ub=np.append(most, np.inf),
             solver=QP,
         )
         if step is None:
@@ -191,7 +211,8 @@ class FailedError(Exception):
 
     def __init__(self, cause: str, last: Trajectory | None = None, share: float = 0.0) -> None:
         super().__init__(cause)
-        self.cause, self.share = cause, share
+        self.cause = cause
+        self.share = share
         self.parts = [] if last is None else [last]
 
     @property
@@ -249,23 +270,30 @@ class _Arm:
     def __init__(
         self, problem: TrajectoryProblem, sampler: KeyframeSampler, *, refine: bool
     ) -> None:
-        self.problem, self.sampler, self.refine = problem, sampler, refine
+        self.problem = problem
+        self.sampler = sampler
+        self.refine = refine
         self.kinematics = ArmKinematics(problem, sampler)
 
     def find(self, z: Floats, waypoint: int) -> tuple[Floats, str]:
         """Return the nearest free configuration to `z`, else the best one, and its failure."""
-        first, cause = self._candidate(z, waypoint)
+
+        def rank(candidate: tuple[Floats, str]) -> tuple[int, float]:
+            configuration, cause = candidate
+            return _CAUSES.index(cause), float(np.abs(configuration - z).sum())
+
+        first, cause = self._find_from(z, waypoint)
         if not cause:
             return first, ""
-        found = [self._candidate(seed, waypoint) for seed in self._seeds(z)]
-        found.append((first, cause))
-        return min(found, key=lambda one: (_CAUSES.index(one[1]), float(np.abs(one[0] - z).sum())))
+        candidates = [self._find_from(guess, waypoint) for guess in self._sample_arms(z)]
+        candidates.append((first, cause))
+        return min(candidates, key=rank)
 
-    def _candidate(self, z: Floats, waypoint: int) -> tuple[Floats, str]:
+    def _find_from(self, z: Floats, waypoint: int) -> tuple[Floats, str]:
         """Return the result of inverse kinematics, and of refinement, from `z`, and its failure."""
-        found, closed = self.kinematics.solve(z, waypoint)
-        if self.refine and not (closed and self._free(found, waypoint)):
-            found, closed = refine_configuration(
+        found, is_closed = self.kinematics.solve(z, waypoint)
+        if self.refine and not (is_closed and self._is_free(found, waypoint)):
+            found, is_closed = refine_configuration(
                 self.problem,
                 self.sampler,
                 found,
@@ -273,21 +301,25 @@ class _Arm:
                 waypoint=waypoint,
                 columns=self.kinematics.columns,
             )
-        if not closed:
+        if not is_closed:
             return found, "no inverse kinematics"
-        return found, "" if self._free(found, waypoint) else "collision"
+        return found, "" if self._is_free(found, waypoint) else "collision"
 
-    def _free(self, z: Floats, waypoint: int) -> bool:
+    def _is_free(self, z: Floats, waypoint: int) -> bool:
+        """Return whether a configuration keeps the clearances at a waypoint."""
         return bool(self.sampler.compute_shortfall(z[None], waypoint)[0] <= CLEAR)
 
-    def _seeds(self, z: Floats) -> Floats:
+    def _sample_arms(self, z: Floats) -> Floats:
         """Return `z` with random arms, shape (SEEDS, n)."""
-        columns, chain, rng = self.kinematics.columns, self.problem.chain, self.sampler.rng
-        lower = np.maximum(chain.lower[columns], -np.pi)
-        upper = np.minimum(chain.upper[columns], np.pi)
+        columns = self.kinematics.columns
+        rng = self.sampler.rng
+        chain_lower = self.problem.chain.lower[columns]
+        chain_upper = self.problem.chain.upper[columns]
+        lower = np.maximum(chain_lower, -np.pi)
+        upper = np.minimum(chain_upper, np.pi)
         arms = rng.uniform(np.minimum(lower, upper), upper, (SEEDS, len(columns)))
         near = z[columns] + rng.normal(0.0, _SPREAD, (SEEDS // 2, len(columns)))
-        arms[: SEEDS // 2] = np.clip(near, chain.lower[columns], chain.upper[columns])
-        seeds = np.tile(z, (SEEDS, 1))
-        seeds[:, columns] = arms
-        return seeds
+        arms[: SEEDS // 2] = np.clip(near, chain_lower, chain_upper)
+        configurations = np.tile(z, (SEEDS, 1))
+        configurations[:, columns] = arms
+        return configurations

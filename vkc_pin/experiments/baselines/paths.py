@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,9 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.coordinates import wrap_angle
 from vkc_pin.world.task.steps import GoTo
 
-_STEPS, _STEP = 25, 0.08  # least number and largest distance [m] of checked poses on a line
+# least number of checked poses on a line, and their largest distance [m]
+_MIN_POSES = 25
+_MAX_DISTANCE = 0.08
 
 
 class BasePaths:
@@ -29,24 +30,29 @@ class BasePaths:
         self.omni = problem.chain.robot.base == "omni"
         z = problem.start.copy()
         z[:3] = 0.0
-        moving, standing = collect_grid_shapes(problem, len(problem.task.phases) - 1, z)
+        moving, fixed = collect_grid_shapes(problem, len(problem.task.phases) - 1, z)
         base = [shape for joint, shape in moving if whole or joint == 1]
-        arena, margin = problem.scene.arena, problem.options.dist_safe
-        turning = problem.chain.robot.lever
-        self._grid = functools.partial(
-            BaseGrid, base, [], standing, arena, turning=turning, cache=problem.cache
+        self._arena = problem.scene.arena
+        self._margin = problem.options.dist_safe
+        self._whole = whole
+        self._make_grid = functools.partial(
+            BaseGrid,
+            base,
+            [],
+            fixed,
+            self._arena,
+            turning=problem.chain.robot.lever,
+            cache=problem.cache,
         )
-        self.grid = self._grid(margin)
-        # Optimisation restores the margins.
-        self._fine: dict[str, Any] = {
-            "margin": 0.0 if whole else margin,
-            "cells": compute_fine_cell_count(arena, margin),
-        }
+        self.grid = self._make_grid(self._margin)
 
     @functools.cached_property
     def finer(self) -> BaseGrid:
         """A grid of smaller cells, for narrow passages."""
-        return self._grid(**self._fine)
+        # Optimisation restores the margins.
+        margin = 0.0 if self._whole else self._margin
+        cells = compute_fine_cell_count(self._arena, self._margin)
+        return self._make_grid(margin=margin, cells=cells)
 
     def path(self, start: Floats, goals: Floats, steps: int) -> Floats | None:
         """Return poses from `start` to a goal, slow at both ends, shape (steps, 3), or None.
@@ -54,13 +60,20 @@ class BasePaths:
         Of several goals, shape (G, 3), it is the first with a straight path, else the nearest.
         """
         goals = np.atleast_2d(goals)
-        for goal in goals if self.omni else ():
-            places = max(_STEPS, int(np.ceil(np.hypot(*(goal - start)[:2]) / _STEP)))
-            if all(self.grid.is_pose_free(*pose) for pose in np.linspace(start, goal, places)):
-                return np.asarray(start + sample_smoothstep(steps)[:, None] * (goal - start))
-        find = functools.partial(shortest_path, start=start.tolist(), goals=goals)
-        found = find(self.grid) or find(self.finer)
+        if self.omni:
+            for goal in goals:
+                if self._is_line_free(start, goal):
+                    return np.asarray(start + sample_smoothstep(steps)[:, None] * (goal - start))
+        found = shortest_path(self.grid, start=start.tolist(), goals=goals)
+        if found is None:
+            found = shortest_path(self.finer, start=start.tolist(), goals=goals)
         return None if found is None else sample_poses(found, steps, turning=self.grid.turning)
+
+    def _is_line_free(self, start: Floats, goal: Floats) -> bool:
+        """Return whether the base is free at poses on the line from a pose to another."""
+        dx, dy, _ = goal - start
+        count = max(_MIN_POSES, int(np.ceil(np.hypot(dx, dy) / _MAX_DISTANCE)))
+        return all(self.grid.is_pose_free(*pose) for pose in np.linspace(start, goal, count))
 
     def find_base_path(self, problem: TrajectoryProblem, goal: Floats) -> Floats | None:
         """Return the base at every waypoint, shape (N, 3), stationary while a latch is released."""
@@ -86,7 +99,10 @@ class BasePaths:
 
 def find_goal_poses(step: GoTo, yaw: float) -> Floats:
     """Return the goal poses of a step, shape (G, 3), those with headings nearest to `yaw` first."""
-    turns = np.linspace(0.0, 2.0 * np.pi, HEADINGS, endpoint=False)
-    turns = wrap_angle(turns if step.yaw is None else np.array([step.yaw - yaw]))
+    if step.yaw is None:
+        turns = wrap_angle(np.linspace(0.0, 2.0 * np.pi, HEADINGS, endpoint=False))
+    else:
+        turns = wrap_angle(np.array([step.yaw - yaw]))
     turns = turns[np.argsort(np.abs(turns), kind="stable")]
-    return np.column_stack([np.tile([step.x, step.y], (len(turns), 1)), yaw + turns])
+    positions = np.tile([step.x, step.y], (len(turns), 1))
+    return np.column_stack([positions, yaw + turns])

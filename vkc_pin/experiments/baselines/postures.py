@@ -21,7 +21,8 @@ ENOUGH = 50
 """Sufficient number of collision-free configurations."""
 TRIES = 20_000
 """Largest number of sampled configurations."""
-_SAME = 1e-6  # [rad]
+# [rad] difference up to which two arms are the same
+_SAME = 1e-6
 
 
 def find_base_poses(
@@ -41,10 +42,13 @@ def find_base_poses(
     """
     sampler = KeyframeSampler(problem, rng)
     found: list[Floats] = []
-    for _ in range(-(-TRIES // SAMPLE_COUNT)):
-        z, solved = sampler.sample(np.tile(near, (SAMPLE_COUNT, 1)), waypoint, "scatter")
-        z = z[solved]
-        found.extend(z[sampler.compute_shortfall(z, waypoint) <= 0.0] if len(z) else [])
+    batch_count = -(-TRIES // SAMPLE_COUNT)
+    for _ in range(batch_count):
+        z, is_solved = sampler.sample(np.tile(near, (SAMPLE_COUNT, 1)), waypoint, "scatter")
+        z = z[is_solved]
+        if len(z):
+            is_free = sampler.compute_shortfall(z, waypoint) <= 0.0
+            found.extend(z[is_free])
         if len(found) >= ENOUGH:
             break
     z = np.array(found[:ENOUGH]).reshape(-1, problem.chain.size)
@@ -57,7 +61,9 @@ def generate_postures(problem: TrajectoryProblem) -> Iterator[Floats]:
     They are: no motion (K = 0); away from a released object, or up with a grasped one; from there
     to home; and from there folded, for narrow passages.
     """
-    robot, sampler = problem.chain.robot, KeyframeSampler(problem, np.random.default_rng(0))
+    robot = problem.chain.robot
+    arm = slice(3, robot.coordinates.size)
+    sampler = KeyframeSampler(problem, np.random.default_rng(0))
 
     def is_free(path: Floats) -> bool:
         end = path[-1:] if len(path) else problem.start[None]
@@ -65,14 +71,20 @@ def generate_postures(problem: TrajectoryProblem) -> Iterator[Floats]:
 
     away = ApproachPaths(sampler).find_release_retreat(problem.start, problem.task.phases[0])
     home = (away[-1] if len(away) else problem.start).copy()
-    home[3 : robot.coordinates.size] = robot.home
+    home[arm] = robot.home
     paths = [np.empty((0, problem.chain.size))]
-    paths += [away] if len(away) else []
-    paths += [] if is_at_home(problem) else [np.vstack([away, home])]
-    yield from filter(is_free, paths)
+    if len(away):
+        paths.append(away)
+    if not is_at_home(problem):
+        paths.append(np.vstack([away, home]))
+    for path in paths:
+        if is_free(path):
+            yield path
     folded = home.copy()
-    folded[3 : robot.coordinates.size] = BaseRoutes(problem).get_folded_arm(0)
-    yield from filter(is_free, [np.vstack([paths[-1], folded])])
+    folded[arm] = BaseRoutes(problem).get_folded_arm(0)
+    path = np.vstack([paths[-1], folded])
+    if is_free(path):
+        yield path
 
 
 def is_at_home(problem: TrajectoryProblem) -> bool:
@@ -84,6 +96,8 @@ def is_at_home(problem: TrajectoryProblem) -> bool:
 def interpolate_path(problem: TrajectoryProblem, path: Floats) -> Floats:
     """Return waypoints from the start through configurations, shape (K, n): shape (N, n)."""
     points = np.vstack([problem.start, path])
-    lengths = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(points, axis=0)).max(axis=1))])
+    steps = np.abs(np.diff(points, axis=0)).max(axis=1)
+    lengths = np.concatenate([[0.0], np.cumsum(steps)])
     at = lengths[-1] * sample_smoothstep(problem.segments)
-    return problem.clip(np.column_stack([np.interp(at, lengths, column) for column in points.T]))
+    columns = [np.interp(at, lengths, column) for column in points.T]
+    return problem.clip(np.column_stack(columns))

@@ -94,20 +94,13 @@ def plan_separately(
     check_integer(retries, "retries", low=1)
     check_integer(finer, "finer", low=1, high=LARGEST_FINER)
     task = compile_task(scene, steps, options)
-    actions: list[BaselineStep] = []
-    for number, step in enumerate(task.steps):
-        if not isinstance(step, BaselineStep):
-            expected = "Actuate, Place, GoTo or Reach"
-            raise InputError(
-                "the baselines know no such step",
-                field=f"steps[{number}]",
-                expected=expected,
-                got=format_value(step),
-            )
-        actions.append(step)
+    actions = _check_steps(task.steps)
     with acquire_cache(planner) as cache, budget.activate():
-        began, times, iterations, before = time.perf_counter(), Counter[str](), 0, cache.build_time
-        best: tuple[float, str, int, Trajectory, Report] | None = None
+        began = time.perf_counter()
+        build_time_before = cache.build_time
+        times = Counter[str]()
+        iterations = 0
+        best: _Outcome | None = None
         for number in range(retries):
             attempt = Attempt(
                 scene,
@@ -117,48 +110,95 @@ def plan_separately(
                 finer=finer,
                 cache=cache,
             )
-            trajectory, progress, cause = attempt.run(actions)
-            before_checks, checked = attempt.times["validation"], time.perf_counter()
-            trajectory, report = _retime(
-                scene, task.steps, trajectory, options, attempt.times, failed=cause != ""
-            )
-            took = time.perf_counter() - checked
-            reserve_time("validation", took)
-            attempt.times["retiming"] += took - (attempt.times["validation"] - before_checks)
-            status = "success" if report.ok else cause or "rejected"
+            outcome = _make_attempt(attempt, number, scene, actions, options)
             iterations += attempt.iterations
             times.update(attempt.times)
-            if best is None or status == "success" or progress > best[0]:
-                best = progress, status, number, trajectory, report
-            ended = budget.stop_status
-            if status == "success" or ended:
+            is_success = outcome.status == "success"
+            if best is None or is_success or outcome.progress > best.progress:
+                best = outcome
+            stop_status = budget.stop_status
+            if is_success or stop_status:
                 break
-        built = cache.build_time - before
+        build_time = cache.build_time - build_time_before
     assert best is not None
-    _, status, tried, trajectory, report = best
-    if ended and status not in ("success", ended):
+    status = best.status
+    report = best.report
+    if stop_status and status not in ("success", stop_status):
         note = f"the attempt with most progress failed with: {status}"
         report = dataclasses.replace(report, notes=(*report.notes, note))
-        status = ended
+        status = stop_status
     statistics = PlanningStatistics(
-        planning_time=time.perf_counter() - began - built,
-        build_time=built,
+        planning_time=time.perf_counter() - began - build_time,
+        build_time=build_time,
         iterations=iterations,
         rounds=number + 1,
         evaluations=budget.evaluations,
     ).with_times(times)
-    name = f"{method}, try {tried + 1}"
     return Plan(
         scene,
         task.steps,
         options,
-        trajectory,
+        best.trajectory,
         report,
         status,
         statistics=statistics,
         seed=int(seed),
-        initialization=name,
+        initialization=f"{method}, try {best.number + 1}",
     )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Outcome:
+    """Outcome of one attempt.
+
+    Attributes:
+        number: Number of the attempt, from 0.
+        progress: Number of completed stages; infinite if all are.
+        status: "success", or the cause of the failure.
+        trajectory: The motion.
+        report: Its validation.
+    """
+
+    number: int
+    progress: float
+    status: str
+    trajectory: Trajectory
+    report: Report
+
+
+def _check_steps(steps: Sequence[Step]) -> list[BaselineStep]:
+    """Check that the baselines know all steps, and return them."""
+    actions: list[BaselineStep] = []
+    for number, step in enumerate(steps):
+        if not isinstance(step, BaselineStep):
+            raise InputError(
+                "the baselines know no such step",
+                field=f"steps[{number}]",
+                expected="Actuate, Place, GoTo or Reach",
+                got=format_value(step),
+            )
+        actions.append(step)
+    return actions
+
+
+def _make_attempt(
+    attempt: Attempt,
+    number: int,
+    scene: Scene,
+    steps: Sequence[BaselineStep],
+    options: Options,
+) -> _Outcome:
+    """Make an attempt, retime and validate its motion, and measure the times of both."""
+    times = attempt.times
+    trajectory, progress, cause = attempt.run(steps)
+    validation_before = times["validation"]
+    began = time.perf_counter()
+    trajectory, report = _retime(scene, steps, trajectory, options, times, failed=cause != "")
+    elapsed = time.perf_counter() - began
+    reserve_time("validation", elapsed)
+    times["retiming"] += elapsed - (times["validation"] - validation_before)
+    status = "success" if report.ok else cause or "rejected"
+    return _Outcome(number, progress, status, trajectory, report)
 
 
 def _retime(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +16,7 @@ from vkc_pin.experiments.harness.tables import (
     compute_quartiles,
     compute_wilson_interval,
     find_common_successes,
+    select,
 )
 from vkc_pin.planning.plan import Plan
 from vkc_pin.visualization.plots.style import (
@@ -24,17 +26,19 @@ from vkc_pin.visualization.plots.style import (
     shade_phases,
     use_style,
 )
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
-_WIDTH = 0.8  # of a group of bars; the distance between groups is 1
-_SAMPLES = 400  # moments of a motion that are drawn
-_ROOM = (
-    2.0  # a scale that is not made for all motions reaches so many times farther than the others
-)
+# width of a group of bars; the distance between groups is 1
+_WIDTH = 0.8
+# times of a motion that are drawn
+_SAMPLES = 400
+# A scale that is not made for all motions reaches so many times farther than the others.
+_SCALE = 2.0
 _BASE = ("x [m/s]", "y [m/s]", "yaw [rad/s]")
 
 
@@ -58,13 +62,15 @@ def success_chart(
         title: Title.
     """
 
-    def bar(scene: str, method: str) -> tuple[float, float, float] | None:
-        own = [bool(r["success"]) for r in records if r["scene"] == scene and r["method"] == method]
-        return _rate(own) if own else None
+    def measure(scene: str, method: str) -> tuple[float, float, float] | None:
+        own = select(records, scene=scene, method=method)
+        return _compute_rate([bool(record["success"]) for record in own]) if own else None
 
-    names = {scene: f"{name}\n{_number(records, scene, methods)}" for scene, name in scenes.items()}
+    names: dict[str, str] = {}
+    for scene, name in scenes.items():
+        names[scene] = f"{name}\n{_describe_number(records, scene, methods)}"
     figure = _draw_groups(
-        names, methods, bar, label="successful trials [%]", form=".0f", title=title
+        names, methods, measure, label="successful trials [%]", form=".0f", title=title
     )
     (axes,) = figure.axes
     axes.set_ylim(0.0, 108.0)
@@ -95,19 +101,25 @@ def means_chart(
             there are none. Otherwise all trials.
     """
     values: dict[tuple[str, str], list[float]] = {}
-    names = {}
+    names: dict[str, str] = {}
     for scene, name in scenes.items():
-        own = [record for record in records if record["scene"] == scene]
-        both = find_common_successes(own, methods) if shared else []
+        own = select(records, scene=scene)
+        common = find_common_successes(own, methods) if shared else []
         for k, method in enumerate(methods):
-            mine = [record for record in own if record["method"] == method]
             if shared:
-                mine = [row[k] for row in both] or [record for record in mine if record["success"]]
+                mine = _select_successes(own, common, k, method)
+            else:
+                mine = select(own, method=method)
             values[scene, method] = numbers(mine, field)
-        trials = f"{len(both)} trial{'s' * (len(both) != 1)}" if both else "own successes"
-        names[scene] = f"{name}\n{trials if shared else _number(own, scene, methods)}"
+        if not shared:
+            trials = _describe_number(own, scene, methods)
+        elif common:
+            trials = _count_trials(len(common))
+        else:
+            trials = "own successes"
+        names[scene] = f"{name}\n{trials}"
 
-    def bar(scene: str, method: str) -> tuple[float, float, float] | None:
+    def measure(scene: str, method: str) -> tuple[float, float, float] | None:
         if not values[scene, method]:
             return None
         mean, deviation = compute_mean_and_deviation(values[scene, method])
@@ -115,8 +127,9 @@ def means_chart(
         return mean - spread, mean, mean + spread
 
     over = "trials in which all methods succeed" if shared else "all trials"
-    title = f"{label.partition(' [')[0].capitalize()}: mean and standard deviation over {over}"
-    figure = _draw_groups(names, methods, bar, label=label, form=".3g", title=title)
+    quantity = label.partition(" [")[0].capitalize()
+    title = f"{quantity}: mean and standard deviation over {over}"
+    figure = _draw_groups(names, methods, measure, label=label, form=".3g", title=title)
     (axes,) = figure.axes
     axes.set_ylim(0.0, 1.06 * axes.get_ylim()[1])
     return save_figure(figure, path)
@@ -136,12 +149,10 @@ def criteria_chart(
         methods: Methods in the order of the bars.
         title: Title.
     """
-    both = find_common_successes(records, methods)
-    where = (
-        f"the\n{len(both)} trial{'s' * (len(both) != 1)} where all succeed"
-        if both
-        else "own successes;\nnowhere all succeed"
-    )
+    common = find_common_successes(records, methods)
+    where = "own successes;\nnowhere all succeed"
+    if common:
+        where = f"the\n{_count_trials(len(common))} where all succeed"
     shared = f"median and quartiles over {where}"
     panels = (
         ("success", "success [%]", "all trials,\n95 % confidence (Wilson)", ".0f"),
@@ -151,30 +162,22 @@ def criteria_chart(
     )
     with use_style():
         figure = new_figure(11.0, 3.4)
-        for axes, (field, name, about, form) in zip(
-            figure.subplots(1, len(panels)), panels, strict=True
-        ):
+        all_axes = figure.subplots(1, len(panels))
+        for axes, (field, name, about, form) in zip(all_axes, panels, strict=True):
             for k, method in enumerate(methods):
-                own = [record for record in records if record["method"] == method]
                 if field in ("base_path_length", "arm_path_length"):
-                    own = [row[k] for row in both] or [
-                        record for record in own if record["success"]
-                    ]
+                    own = _select_successes(records, common, k, method)
+                else:
+                    own = select(records, method=method)
                 values = numbers(own, field)
-                if values:
-                    interval = (
-                        _rate([value > 0.0 for value in values])
-                        if field == "success"
-                        else compute_quartiles(values)
-                    )
-                    _bar(
-                        axes,
-                        k,
-                        interval,
-                        COLOURS[k % len(COLOURS)],
-                        f"{interval[1]:{form}}",
-                        width=0.7,
-                    )
+                if not values:
+                    continue
+                if field == "success":
+                    interval = _compute_rate([value > 0.0 for value in values])
+                else:
+                    interval = compute_quartiles(values)
+                colour = COLOURS[k % len(COLOURS)]
+                _draw_bar(axes, k, interval, colour, f"{interval[1]:{form}}", width=0.7)
             _name_bars(axes, methods, 0.6)
             axes.set_ylim(0.0, 110.0 if field == "success" else 1.12 * axes.get_ylim()[1])
             axes.set_title(name, fontsize=9.5)
@@ -197,48 +200,16 @@ def motions_chart(plans: Mapping[str, Plan], path: str | Path | None, *, title: 
         figure = new_figure(1.2 + 4.0 * len(plans), 7.0)
         columns: Any = figure.subplots(3, len(plans), sharex=True, sharey="row", squeeze=False).T
         for (position, velocity, base), (name, plan) in zip(columns, plans.items(), strict=True):
-            motion = plan.trajectory
-            fine = np.unique(
-                np.concatenate(
-                    [np.linspace(motion.times[0], motion.times[-1], _SAMPLES), motion.times]
-                )
-            )
-            places, rates = motion(fine), motion.velocity(fine)
-            steps: Any = {
-                "linewidth": 1.2,
-                "drawstyle": "steps-post" if motion.curve is None else "default",
-            }
-            for k, joint in enumerate(range(3, motion.robot_size)):
-                colour = COLOURS[k % len(COLOURS)]
-                label = motion.names[joint].removesuffix("_joint")
-                position.plot(fine, places[:, joint], color=colour, label=label)
-                velocity.plot(fine, rates[:, joint], color=colour, **steps)
-            for k, label in enumerate(_BASE):
-                base.plot(fine, rates[:, k], color=COLOURS[k], label=label, **steps)
-            for axes in (position, velocity, base):
-                shade_phases(axes, motion)
-                axes.margins(x=0.0)
-            outcome = "" if plan.success else f", FAILED: {plan.status}"
-            position.set_title(
-                f"{name}{outcome} ({motion.times[-1] - motion.times[0]:.1f} s)", fontsize=9.5
-            )
-            base.set_xlabel("time [s]")
-        good = [plan.trajectory for plan in plans.values() if plan.success]
-        for row, part in (
-            (1, lambda motion: slice(3, motion.robot_size)),
-            (2, lambda motion: slice(0, 3)),
-        ):
-            if good and len(good) < len(plans):
-                largest = max(
-                    float(np.abs(motion.velocity(motion.times)[:, part(motion)]).max())
-                    for motion in good
-                )
-                columns[0][row].set_ylim(-_ROOM * largest, _ROOM * largest)
-        for axes, label in zip(
-            columns[0],
-            ("arm positions [rad]", "arm velocities [rad/s]", "base velocity"),
-            strict=True,
-        ):
+            _draw_motion(position, velocity, base, name, plan)
+        successes = [plan.trajectory for plan in plans.values() if plan.success]
+        if successes and len(successes) < len(plans):
+            arm_speeds = [_find_max_speed(motion, 3, motion.robot_size) for motion in successes]
+            base_speeds = [_find_max_speed(motion, 0, 3) for motion in successes]
+            _, arm_axes, base_axes = columns[0]
+            arm_axes.set_ylim(-_SCALE * max(arm_speeds), _SCALE * max(arm_speeds))
+            base_axes.set_ylim(-_SCALE * max(base_speeds), _SCALE * max(base_speeds))
+        labels = ("arm positions [rad]", "arm velocities [rad/s]", "base velocity")
+        for axes, label in zip(columns[0], labels, strict=True):
             axes.set_ylabel(label)
         for axes in columns[-1][[0, 2]]:
             axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7.5)
@@ -246,27 +217,78 @@ def motions_chart(plans: Mapping[str, Plan], path: str | Path | None, *, title: 
         return save_figure(figure, path)
 
 
+def _draw_motion(position: Axes, velocity: Axes, base: Axes, name: str, plan: Plan) -> None:
+    """Draw arm positions, arm velocities and base velocities of a plan over time."""
+    motion = plan.trajectory
+    begin, end = motion.times[[0, -1]]
+    times = np.unique(np.concatenate([np.linspace(begin, end, _SAMPLES), motion.times]))
+    positions = motion(times)
+    velocities = motion.velocity(times)
+    style: Any = {
+        "linewidth": 1.2,
+        "drawstyle": "steps-post" if motion.curve is None else "default",
+    }
+    for k, joint in enumerate(range(3, motion.robot_size)):
+        colour = COLOURS[k % len(COLOURS)]
+        label = motion.names[joint].removesuffix("_joint")
+        position.plot(times, positions[:, joint], color=colour, label=label)
+        velocity.plot(times, velocities[:, joint], color=colour, **style)
+    for k, label in enumerate(_BASE):
+        base.plot(times, velocities[:, k], color=COLOURS[k], label=label, **style)
+    for axes in (position, velocity, base):
+        shade_phases(axes, motion)
+        axes.margins(x=0.0)
+    outcome = "" if plan.success else f", FAILED: {plan.status}"
+    position.set_title(f"{name}{outcome} ({end - begin:.1f} s)", fontsize=9.5)
+    base.set_xlabel("time [s]")
+
+
+def _find_max_speed(motion: Trajectory, first: int, last: int) -> float:
+    """Return the largest speed at waypoints among the coordinates from `first` to `last` - 1."""
+    return float(np.abs(motion.velocity(motion.times)[:, first:last]).max())
+
+
+def _select_successes(
+    records: Sequence[Record],
+    common: Sequence[tuple[Record, ...]],
+    k: int,
+    method: str,
+) -> list[Record]:
+    """Return the records of method k where all methods succeed, or else its own successes."""
+    if common:
+        return [row[k] for row in common]
+    own = select(records, method=method)
+    return [record for record in own if record["success"]]
+
+
+def _count_trials(count: int) -> str:
+    return "1 trial" if count == 1 else f"{count} trials"
+
+
 def _draw_groups(
     scenes: Mapping[str, str],
     methods: Sequence[str],
-    bar: Callable[[str, str], tuple[float, float, float] | None],
+    measure: Callable[[str, str], tuple[float, float, float] | None],
     *,
     label: str,
     form: str,
     title: str,
 ) -> Figure:
-    """Draw grouped bars; `bar` returns lower end, height and upper end, or None."""
+    """Draw grouped bars; `measure` returns lower end, height and upper end, or None."""
     with use_style():
-        figure = new_figure(max(6.0, 1.0 + 0.5 * len(scenes) * (len(methods) + 1)), 3.8)
+        figure_width = max(6.0, 1.0 + 0.5 * len(scenes) * (len(methods) + 1))
+        figure = new_figure(figure_width, 3.8)
         axes = figure.subplots()
         width = _WIDTH / len(methods)
         for k, method in enumerate(methods):
-            places = np.arange(len(scenes)) + (k - (len(methods) - 1) / 2.0) * width
+            shift = (k - (len(methods) - 1) / 2.0) * width
+            places = np.arange(len(scenes)) + shift
             colour = COLOURS[k % len(COLOURS)]
             for place, scene in zip(places, scenes, strict=True):
-                interval = bar(scene, method)
+                interval = measure(scene, method)
                 if interval is not None:
-                    _bar(axes, place, interval, colour, f"{interval[1]:{form}}", width=0.9 * width)
+                    text = f"{interval[1]:{form}}"
+                    _draw_bar(axes, place, interval, colour, text, width=0.9 * width)
             axes.bar(0.0, 0.0, color=colour, label=method)
         _name_bars(axes, list(scenes.values()), 0.5)
         axes.set_ylabel(label)
@@ -275,13 +297,13 @@ def _draw_groups(
     return figure
 
 
-def _rate(good: Sequence[bool]) -> tuple[float, float, float]:
+def _compute_rate(successes: Sequence[bool]) -> tuple[float, float, float]:
     """Return Wilson's lower limit, success rate and upper limit [%]."""
-    low, high = compute_wilson_interval(sum(good), len(good))
-    return 100.0 * low, 100.0 * sum(good) / len(good), 100.0 * high
+    low, high = compute_wilson_interval(sum(successes), len(successes))
+    return 100.0 * low, 100.0 * sum(successes) / len(successes), 100.0 * high
 
 
-def _bar(
+def _draw_bar(
     axes: Axes,
     place: float,
     interval: tuple[float, float, float],
@@ -309,12 +331,11 @@ def _name_bars(axes: Axes, names: Sequence[str], margin: float) -> None:
     axes.set_axisbelow(True)
 
 
-def _number(records: Sequence[Record], scene: str, methods: Sequence[str]) -> str:
+def _describe_number(records: Sequence[Record], scene: str, methods: Sequence[str]) -> str:
     """Return the number of trials of each method in a scene, in words."""
-    shown = [
-        record["method"]
-        for record in records
-        if record["scene"] == scene and record["method"] in methods
-    ]
-    numbers = sorted({shown.count(method) for method in shown})
-    return f"{' or '.join(map(str, numbers))} trials each" if numbers else "no trials"
+    own = select(records, scene=scene)
+    counts = Counter(record["method"] for record in own if record["method"] in methods)
+    if not counts:
+        return "no trials"
+    different = sorted(set(counts.values()))
+    return f"{' or '.join(str(count) for count in different)} trials each"

@@ -34,15 +34,8 @@ def describe_environment(**settings: Any) -> dict[str, Any]:
 @functools.cache
 def find_commit() -> str | None:
     """Return the commit of the sources, with "-dirty" if they are changed; None without git."""
-    command = [
-        "git",
-        "-C",
-        str(find_package_folder()),
-        "describe",
-        "--always",
-        "--dirty",
-        "--abbrev=12",
-    ]
+    folder = str(find_package_folder())
+    command = ["git", "-C", folder, "describe", "--always", "--dirty", "--abbrev=12"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
     except (OSError, subprocess.SubprocessError):
@@ -52,11 +45,14 @@ def find_commit() -> str | None:
 
 def trial(plan: Plan, *, method: str, seed: int, **more: Any) -> dict[str, Any]:
     """Return the record of a plan."""
-    m, violations = plan.metrics, plan.report.violations
-    failed: str | None = None if plan.success else plan.status
-    if violations and not plan.success:
-        failed = f"{violations[0].constraint} {violations[0].subject}"
-    lengths = ("planning_time", "base_path_length", "base_path_length_l1", "arm_path_length")
+    metrics = plan.metrics
+    violations = plan.report.violations
+    times = {name: value for name, value in metrics.items() if name.startswith("time_")}
+    failed: str | None = None
+    if not plan.success:
+        failed = plan.status
+        if violations:
+            failed = f"{violations[0].constraint} {violations[0].subject}"
     return {
         "scene": plan.scene.name,
         "method": method,
@@ -64,16 +60,19 @@ def trial(plan: Plan, *, method: str, seed: int, **more: Any) -> dict[str, Any]:
         "seed": seed,
         "success": plan.success,
         "status": plan.status,
-        **{field: m[field] for field in lengths},
-        "clearance": m["clearance"] if np.isfinite(m["clearance"]) else None,
-        "closure_error": m["closure_error"],
-        "iterations": int(m["iterations"]),
-        "rounds": int(m["rounds"]),
-        "evaluations": int(m.get("evaluations", 0)),
+        "planning_time": metrics["planning_time"],
+        "base_path_length": metrics["base_path_length"],
+        "base_path_length_l1": metrics["base_path_length_l1"],
+        "arm_path_length": metrics["arm_path_length"],
+        "clearance": metrics["clearance"] if np.isfinite(metrics["clearance"]) else None,
+        "closure_error": metrics["closure_error"],
+        "iterations": int(metrics["iterations"]),
+        "rounds": int(metrics["rounds"]),
+        "evaluations": int(metrics.get("evaluations", 0)),
         "waypoints": len(plan.trajectory.times),
         "initialization": plan.initialization,
-        "build_time": m["build_time"],
-        **{key: value for key, value in m.items() if key.startswith("time_")},
+        "build_time": metrics["build_time"],
+        **times,
         "failed_constraint": failed,
         "violations": [str(violation) for violation in violations],
         "commit": find_commit(),
@@ -83,14 +82,16 @@ def trial(plan: Plan, *, method: str, seed: int, **more: Any) -> dict[str, Any]:
 
 def compute_peaks(trajectory: Trajectory) -> dict[str, float]:
     """Return the largest velocity [rad/s] and acceleration [rad/s²] of any arm joint."""
-    arm, curve = slice(3, trajectory.robot_size), trajectory.curve
-    rates = (
-        (trajectory.velocities(), trajectory.accelerations())
-        if curve is None
-        else curve.compute_max_rates()
-    )
-    largest = [float(np.abs(rate[:, arm]).max(initial=0.0)) for rate in rates]
-    return dict(zip(("peak_velocity", "peak_acceleration"), largest, strict=True))
+    arm = slice(3, trajectory.robot_size)
+    if trajectory.curve is None:
+        velocities = trajectory.velocities()
+        accelerations = trajectory.accelerations()
+    else:
+        velocities, accelerations = trajectory.curve.compute_max_rates()
+    return {
+        "peak_velocity": float(np.abs(velocities[:, arm]).max(initial=0.0)),
+        "peak_acceleration": float(np.abs(accelerations[:, arm]).max(initial=0.0)),
+    }
 
 
 def values(trials: Iterable[Record], field: str) -> list[float]:

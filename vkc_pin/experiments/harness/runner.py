@@ -37,8 +37,12 @@ Function = Callable[[dict[str, Any]], Mapping[str, Any] | Sequence[Mapping[str, 
 _JOURNAL = "trials.jsonl"
 # Sources that do not affect a trial: a run may be resumed after a change there.
 _UNRELATED = ("cli/", "datasets/", "experiments/", "utils/parallel.py", "utils/journal.py")
-_PLANNERS = "experiments/baselines/"  # affect trials
+# Sources among these that do.
+_PLANNERS = "experiments/baselines/"
+_SOURCES = (".py", ".cpp", ".hpp")
 _DESCRIPTIONS = (".yaml", ".urdf", ".srdf")
+# characters of a digest
+_DIGEST_LENGTH = 12
 
 
 def describe_limit(about: Mapping[str, Any]) -> str:
@@ -114,13 +118,15 @@ def run(
         raise InputError("this is no folder", file=out, field="out") from None
     check_writable(out / _JOURNAL)
     about = describe_environment()
-    made = about.pop("commit")  # the digest of the sources decides whether trials belong together
-    about["versions"]["sources"] = _sources()
-    described = json.dumps([todo[key] for key in sorted(todo)], sort_keys=True).encode()
+    # The digest of the sources decides whether trials belong together.
+    commit = about.pop("commit")
+    about["versions"]["sources"] = _compute_sources_digest()
+    keys = sorted(todo)
+    specification = json.dumps([todo[key] for key in keys], sort_keys=True)
     header = {
         "settings": dict(settings),
         **about,
-        "specification": hashlib.sha256(described).hexdigest()[:12],
+        "specification": hashlib.sha256(specification.encode()).hexdigest()[:_DIGEST_LENGTH],
     }
     with (out / _JOURNAL).open("a+b") as stream:
         journal = Journal(out / _JOURNAL, stream, header)
@@ -136,21 +142,23 @@ def run(
                 raise KeyboardInterrupt(
                     f"{len(journal.lines)} of {len(todo)} trials are done and kept in {out}"
                 ) from None
-        records = [record for key in sorted(todo) for record in journal.lines[key]]
-        measured = {"sessions": journal.sessions, "peak_memory_mb": round(journal.memory, 1)}
-    result = {
-        "meta": {
-            "commit": _commits(records) or made,
-            **about,
-            **json.loads(json.dumps(dict(settings))),
-            **measured,
-        },
-        "trials": records,
+        records: list[Mapping[str, Any]] = []
+        for key in keys:
+            records += journal.lines[key]
+        sessions = journal.sessions
+        peak_memory = round(journal.memory, 1)
+    plain_settings = json.loads(json.dumps(dict(settings)))
+    meta = {
+        "commit": _list_commits(records) or commit,
+        **about,
+        **plain_settings,
+        "sessions": sessions,
+        "peak_memory_mb": peak_memory,
     }
+    result = {"meta": meta, "trials": records}
+    text = json.dumps(result, indent=1, allow_nan=False) + "\n"
     write_atomically(out / "results.csv", to_csv(records).encode())
-    write_atomically(
-        out / "results.json", (json.dumps(result, indent=1, allow_nan=False) + "\n").encode()
-    )
+    write_atomically(out / "results.json", text.encode())
     if format_results is not None:
         write_atomically(out / "table.md", format_results(result).encode())
     return result
@@ -169,13 +177,16 @@ def check_folder(out: str | Path, journals: Sequence[str] = (_JOURNAL,)) -> None
     out = Path(out)
     if not out.is_dir():
         return
-    files = sorted(
-        path.name for path in out.iterdir() if not path.is_dir() and not path.name.startswith(".")
-    )
+    names = sorted(path.name for path in out.iterdir() if not path.is_dir())
+    files = [name for name in names if not name.startswith(".")]
     if files and not any((out / name).is_file() for name in journals):
-        expected = "a new folder, or one with trials of this run"
-        problem, got = "there are other files in this folder", ", ".join(files[:3])
-        raise InputError(problem, file=out, field="out", expected=expected, got=got)
+        raise InputError(
+            "there are other files in this folder",
+            file=out,
+            field="out",
+            expected="a new folder, or one with trials of this run",
+            got=", ".join(files[:3]),
+        )
     check_links(out)
 
 
@@ -185,7 +196,8 @@ def select_names(kind: str, names: Iterable[str], choices: Iterable[str]) -> tup
     Raises:
         InputError: There are no names, or one is no choice.
     """
-    names, choices = list(names), list(dict.fromkeys(choices))
+    names = list(names)
+    choices = list(dict.fromkeys(choices))
     for name in names:
         if name not in choices:
             raise UnknownNameError(kind, name, choices, field=f"{kind}s")
@@ -210,13 +222,15 @@ def _run(
     bar: Any,
 ) -> None:
     """Run trials, append each to the journal, and print errors."""
-    began, told = time.perf_counter(), set[str]()
+    began = time.perf_counter()
+    reported = set[str]()  # errors
     journal.append({"session": {"jobs": jobs}})
     tasks = ((str(trial["key"]), trial) for trial in trials)
-    found = run_tasks(functools.partial(_attempt, function), tasks, jobs=jobs, scheduler=scheduler)
-    with bar, contextlib.closing(found) as lines:
-        for key, line in lines:
-            line = _given_up(key, line) if isinstance(line, CrashedTask) else line
+    attempt = functools.partial(_attempt, function)
+    results = run_tasks(attempt, tasks, jobs=jobs, scheduler=scheduler)
+    with bar, contextlib.closing(results):
+        for key, result in results:
+            line = _describe_crash(key, result) if isinstance(result, CrashedTask) else result
             if any(record.get("status") == "interrupted" for record in line["records"]):
                 raise KeyboardInterrupt
             journal.append({**line, "seconds": round(time.perf_counter() - began, 3)})
@@ -224,80 +238,78 @@ def _run(
             if "traceback" in line:
                 (message,) = line["records"][0]["violations"]
                 # Many trials may fail alike.
-                detail = "" if message in told else f"\n{line['traceback']}"
-                tqdm.write(
-                    f"{line['key']} failed with an error: {message}{detail}", file=sys.stderr
-                )
-                told.add(message)
+                detail = "" if message in reported else f"\n{line['traceback']}"
+                text = f"{line['key']} failed with an error: {message}{detail}"
+                tqdm.write(text, file=sys.stderr)
+                reported.add(message)
 
 
 def _attempt(function: Function, trial: dict[str, Any]) -> dict[str, Any]:
     """Run a trial and return its line of the journal."""
-    key, more = trial["key"], {}
+    trace: str | None = None
     try:
         result = function(dict(trial))
         found = [result] if isinstance(result, Mapping) else list(result)
-        text = json.dumps([{"key": key, **record} for record in found], default=_plain)
-        records = json.loads(text, parse_constant=lambda _: None)  # numbers that JSON does not know
+        text = json.dumps([{"key": trial["key"], **record} for record in found], default=_convert)
+        # JSON knows neither NaN nor infinity.
+        records = json.loads(text, parse_constant=lambda _: None)
     except Exception as error:
-        message = f"{type(error).__name__}: {error}"
-        failure = {
-            "success": False,
-            "status": "error",
-            "failed_constraint": "error",
-            "violations": [message],
-        }
-        records, more = [{**trial, **failure}], {"traceback": traceback.format_exc()}
-    return {"key": key, "memory_mb": round(measure_peak_memory(), 1), "records": records, **more}
+        failure = _make_failure(f"{type(error).__name__}: {error}")
+        records = [{**trial, **failure}]
+        trace = traceback.format_exc()
+    memory = round(measure_peak_memory(), 1)
+    line = {"key": trial["key"], "memory_mb": memory, "records": records}
+    if trace is not None:
+        line["traceback"] = trace
+    return line
 
 
-def _given_up(key: str, died: CrashedTask) -> dict[str, Any]:
+def _describe_crash(key: str, crash: CrashedTask) -> dict[str, Any]:
     """Return the line of a trial that no process survived."""
-    failure = {
-        "key": key,
+    failure = {"key": key, **_make_failure(crash.reason)}
+    return {"key": key, "memory_mb": 0.0, "records": [failure], "traceback": crash.reason}
+
+
+def _make_failure(message: str) -> dict[str, Any]:
+    """Return the fields of a record that an error ended."""
+    return {
         "success": False,
         "status": "error",
         "failed_constraint": "error",
-        "violations": [died.reason],
+        "violations": [message],
     }
-    return {"key": key, "memory_mb": 0.0, "records": [failure], "traceback": died.reason}
 
 
-def _commits(records: Iterable[Mapping[str, Any]]) -> str:
+def _list_commits(records: Iterable[Mapping[str, Any]]) -> str:
     """Return the distinct commits of records."""
-    return ", ".join(
-        dict.fromkeys(str(record["commit"]) for record in records if record.get("commit"))
-    )
+    commits = [str(record["commit"]) for record in records if record.get("commit")]
+    return ", ".join(dict.fromkeys(commits))
 
 
-def _plain(value: Any) -> Any:
+def _convert(value: Any) -> Any:
     """Convert mappings and NumPy types for JSON."""
-    if not isinstance(value, Mapping | np.ndarray | np.generic):
-        raise TypeError(f"Object of type {type(value).__name__} is not JSON serializable")
-    return dict(value) if isinstance(value, Mapping) else value.tolist()
+    if isinstance(value, Mapping):
+        return dict(value)
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    raise TypeError(f"Object of type {type(value).__name__} is not JSON serializable")
 
 
-def _sources() -> str:
+def _compute_sources_digest() -> str:
     """Return a digest of the sources, scenes and robots that planning depends on."""
-    package, digest = find_package_folder(), hashlib.sha256()
-    named = {
-        path.relative_to(package).as_posix(): path
-        for suffix in ("py", "cpp", "hpp")
-        for path in package.rglob(f"*.{suffix}")
-    }
-    named = {
-        name: path
-        for name, path in named.items()
-        if name.startswith(_PLANNERS) or not name.startswith(_UNRELATED)
-    }
+    package = find_package_folder()
+    named: dict[str, Path] = {}
+    for suffix in _SOURCES:
+        for path in package.rglob(f"*{suffix}"):
+            name = path.relative_to(package).as_posix()
+            if name.startswith(_PLANNERS) or not name.startswith(_UNRELATED):
+                named[name] = path
     for kind in ("scenes", "robots"):
-        files = (
-            path for path in find_resource_folder(kind).rglob("*") if path.suffix in _DESCRIPTIONS
-        )
-        named |= {
-            f"{kind}/{path.relative_to(find_resource_folder(kind)).as_posix()}": path
-            for path in files
-        }
+        folder = find_resource_folder(kind)
+        for path in folder.rglob("*"):
+            if path.suffix in _DESCRIPTIONS:
+                named[f"{kind}/{path.relative_to(folder).as_posix()}"] = path
+    digest = hashlib.sha256()
     for name in sorted(named):
         digest.update(f"{name}\n".encode() + named[name].read_bytes())
-    return digest.hexdigest()[:12]
+    return digest.hexdigest()[:_DIGEST_LENGTH]

@@ -20,10 +20,11 @@ def plan_step_by_step(
     """Return the plans of steps up to the first failure."""
     plans: list[Plan] = []
     for step in steps:
-        plans.append(plan(scene, [step], options=options, seed=seed, **LIMITS))
-        if not plans[-1].success:
+        found = plan(scene, [step], options=options, seed=seed, **LIMITS)
+        plans.append(found)
+        if not found.success:
             break
-        scene = plans[-1].end_scene()
+        scene = found.end_scene()
     return plans
 
 
@@ -35,29 +36,36 @@ def combine_records(
         trial(one, method=method, seed=seed, duration=one.trajectory.metrics()["duration"])
         for one in plans
     ]
-    sums = (
-        "planning_time",
-        "base_path_length",
-        "base_path_length_l1",
-        "arm_path_length",
-        "duration",
-        "build_time",
-    )
-    counts = ("iterations", "rounds", "evaluations", "waypoints")
     times = [key for key in records[0] if key.startswith("time_")]
     clearances = [record["clearance"] for record in records if record["clearance"] is not None]
-    good = sum(record["success"] for record in records)
-    failed = records[-1]["failed_constraint"]
-    return {
-        **records[-1],
-        **{field: sum(record[field] for record in records) for field in (*sums, *counts, *times)},
-        "start": records[0]["start"],
-        "success": good == of,
-        "clearance": min(clearances, default=None),
-        "closure_error": max(record["closure_error"] for record in records),
-        "initialization": "; ".join(dict.fromkeys(record["initialization"] for record in records)),
-        "failed_constraint": failed
-        and f"{failed} at steps[{len(plans) - 1}], {plans[-1].steps[0]}",
-        "steps_done": good,
-        **more,
-    }
+    initializations = dict.fromkeys(record["initialization"] for record in records)
+    success_count = sum(record["success"] for record in records)
+    combined = dict(records[-1])
+    for field in (*_SUMMED, *times):
+        combined[field] = sum(record[field] for record in records)
+    combined["start"] = records[0]["start"]
+    combined["success"] = success_count == of
+    combined["clearance"] = min(clearances, default=None)
+    combined["closure_error"] = max(record["closure_error"] for record in records)
+    combined["initialization"] = "; ".join(initializations)
+    if combined["failed_constraint"]:
+        where = f"steps[{len(plans) - 1}], {plans[-1].steps[0]}"
+        combined["failed_constraint"] += f" at {where}"
+    combined["steps_done"] = success_count
+    combined.update(more)
+    return combined
+
+
+# Fields of records that are added up.
+_SUMMED = (
+    "planning_time",
+    "base_path_length",
+    "base_path_length_l1",
+    "arm_path_length",
+    "duration",
+    "build_time",
+    "iterations",
+    "rounds",
+    "evaluations",
+    "waypoints",
+)

@@ -28,13 +28,16 @@ TIMES = {
 }
 """Parts of planning time: field → name. The rest is problem setup and retiming."""
 JUDGED = "Success is the result of the independent validation."
-_LEAST = 1e-6  # smallest difference, in any unit, of a lower value
+# smallest difference, in any unit, of a lower value
+_LEAST = 1e-6
 
 
 def to_csv(records: Sequence[Record]) -> str:
     """Return records as CSV with a column for every field; values other than text are JSON."""
     stream = io.StringIO()
-    columns = list(dict.fromkeys(field for record in records for field in record))
+    columns: dict[str, None] = {}  # a set in the order of insertion
+    for record in records:
+        columns.update(dict.fromkeys(record))
     writer = csv.DictWriter(stream, columns, lineterminator="\n")
     writer.writeheader()
     for record in records:
@@ -43,18 +46,22 @@ def to_csv(records: Sequence[Record]) -> str:
 
 
 def _to_text(value: Any) -> str:
-    if value is None or isinstance(value, str):
-        return value or ""
+    """Return a cell of the CSV file."""
+    if value is None:
+        return ""
+    if isinstance(value, str):
+        return value
     return json.dumps(value, ensure_ascii=False)
 
 
 def format_table(head: Sequence[str], rows: Iterable[Sequence[str]], *, text: int = 1) -> str:
     """Return a Markdown table whose first `text` columns are aligned left."""
     rule = ["---" if column < text else "---:" for column in range(len(head))]
-    return "\n".join(
-        "| " + " | ".join(str(cell).replace("|", "\\|") for cell in row) + " |"
-        for row in (head, rule, *rows)
-    )
+    lines: list[str] = []
+    for row in (head, rule, *rows):
+        cells = [str(cell).replace("|", "\\|") for cell in row]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
 
 
 def compute_wilson_interval(good: int, number: int) -> tuple[float, float]:
@@ -69,8 +76,9 @@ def compute_wilson_interval(good: int, number: int) -> tuple[float, float]:
 
 def compute_quartiles(values: Sequence[float]) -> tuple[float, float, float]:
     """Return first quartile, median and third quartile; NaN without values."""
-    found = np.percentile(values, (25, 50, 75)) if len(values) else np.full(3, np.nan)
-    first, median, third = found.tolist()
+    if not len(values):
+        return float("nan"), float("nan"), float("nan")
+    first, median, third = np.percentile(values, (25, 50, 75)).tolist()
     return first, median, third
 
 
@@ -103,16 +111,22 @@ def format_decimal(value: float) -> str:
 def compute_mean_and_deviation(values: Sequence[float]) -> tuple[float, float]:
     """Return mean and sample standard deviation (n − 1); NaN for too few values."""
     mean = float(np.mean(values)) if len(values) else float("nan")
-    return mean, float(np.std(values, ddof=1)) if len(values) > 1 else float("nan")
+    deviation = float(np.std(values, ddof=1)) if len(values) > 1 else float("nan")
+    return mean, deviation
 
 
 def count_failures(records: Iterable[Record]) -> str:
     """Return the kinds of failures and their counts, most frequent first."""
     kinds = Counter[str]()
     for record in records:
-        if not record["success"]:
-            status, blame = str(record["status"]), str(record.get("failed_constraint") or "")
-            kinds[status if blame in ("", status) else f"{status} ({blame.split()[0]})"] += 1
+        if record["success"]:
+            continue
+        status = str(record["status"])
+        constraint = str(record.get("failed_constraint") or "")
+        if constraint in ("", status):
+            kinds[status] += 1
+        else:
+            kinds[f"{status} ({constraint.split()[0]})"] += 1
     order = sorted(kinds.items(), key=lambda item: (-item[1], item[0]))
     return ", ".join(f"{kind} {number}" for kind, number in order) or "none"
 
@@ -130,17 +144,20 @@ def methods_table(
 
     Planning times are those of all trials, path lengths those of successes.
     """
-    rows = []
-    for name, group in _groups(records, scenes):
+    rows: list[list[str]] = []
+    for name, group in _group_by_scene(records, scenes):
         for method in methods:
-            if own := select(group, method=method):
-                times = map(format_decimal, distribution(own, "planning_time"))
-                lengths = format_medians(
-                    select(own, success=True), "base_path_length", "arm_path_length"
-                )
-                rows.append([name, method, count(own), *times, *lengths, *count_timeouts(own)])
+            own = select(group, method=method)
+            if not own:
+                continue
+            median, late = distribution(own, "planning_time")
+            times = [format_decimal(median), format_decimal(late)]
+            successes = select(own, success=True)
+            lengths = format_medians(successes, "base_path_length", "arm_path_length")
+            rows.append([name, method, count(own), *times, *lengths, *count_timeouts(own)])
     head = ["scene", "method", "success", "time, median [s]", "95th percentile [s]"]
-    return format_table([*head, "base [m]", "arm [rad]", "timed out", "failures"], rows, text=2)
+    head += ["base [m]", "arm [rad]", "timed out", "failures"]
+    return format_table(head, rows, text=2)
 
 
 def find_common_successes(
@@ -150,15 +167,19 @@ def find_common_successes(
     found: dict[str, dict[tuple[Any, ...], Record]] = {method: {} for method in methods}
     for record in records:
         if record["success"] and record["method"] in found:
-            place = record["scene"], record["number"], record.get("repeat", 0)
-            found[record["method"]][place] = record
-    places = [place for place in found[methods[0]] if all(place in own for own in found.values())]
-    return [tuple(found[method][place] for method in methods) for place in places]
+            trial = (record["scene"], record["number"], record.get("repeat", 0))
+            found[record["method"]][trial] = record
+    common: list[tuple[Record, ...]] = []
+    for trial in found[methods[0]]:
+        if all(trial in own for own in found.values()):
+            common.append(tuple(found[method][trial] for method in methods))
+    return common
 
 
 def count_lower(pairs: Sequence[tuple[Record, ...]], field: str) -> int:
     """Count pairs whose first value is lower than the second, beyond rounding."""
-    return sum(float(one[field]) < float(other[field]) - _LEAST for one, other in pairs)
+    lower = [pair for pair in pairs if float(pair[0][field]) < float(pair[1][field]) - _LEAST]
+    return len(lower)
 
 
 def comparison_table(
@@ -168,38 +189,53 @@ def comparison_table(
     names: tuple[str, str],
 ) -> str:
     """Compare path lengths of two methods, with displayed names, where both succeed."""
-    rows = []
-    for name, group in _groups(records, scenes):
+    rows: list[list[str]] = []
+    for name, group in _group_by_scene(records, scenes):
         both = find_common_successes(group, methods)
         for field, shown in EFFORTS.items():
-            spreads = [_spread([float(pair[k][field]) for pair in both]) for k in (0, 1)]
-            rows.append([name, shown, *spreads, f"{count_lower(both, field)} of {len(both)}"])
+            first = _format_quartiles([float(pair[0][field]) for pair in both])
+            second = _format_quartiles([float(pair[1][field]) for pair in both])
+            lower = f"{count_lower(both, field)} of {len(both)}"
+            rows.append([name, shown, first, second, lower])
     head = ["scene", "path length", *(f"{name}: median (quartiles)" for name in names)]
     return format_table([*head, f"lower with {names[0]}"], rows, text=2)
 
 
 def describe_run(about: Mapping[str, Any]) -> str:
     """Return machine, versions and duration of a run in sentences."""
-    machine, versions = about["machine"], {**about["versions"]}
+    machine = about["machine"]
+    versions = dict(about["versions"])
     sources = versions.pop("sources", None)
     listed = ", ".join(f"{name} {version}" for name, version in versions.items())
+    if sources:
+        listed += f" (sources {sources})"
     processor = machine["processor"] or machine["machine"]
     text = f"Measured on {machine['cores']} cores of {processor}, {machine['system']}, "
-    text += f"Python {machine['python']}, {listed}{f' (sources {sources})' if sources else ''}."
-    if sessions := about.get("sessions"):
-        jobs = " or ".join(str(jobs) for jobs in sorted({session["jobs"] for session in sessions}))
+    text += f"Python {machine['python']}, {listed}."
+    sessions = about.get("sessions")
+    if sessions:
+        jobs = sorted({session["jobs"] for session in sessions})
+        at_a_time = " or ".join(str(number) for number in jobs)
+        trials = sum(session["trials"] for session in sessions)
         minutes = sum(session["seconds"] for session in sessions) / 60.0
-        text += f" {sum(session['trials'] for session in sessions)} trials, {jobs} at a time, "
-        text += f"took {minutes:.1f} min and up to {about['peak_memory_mb']:.0f} MB a process."
+        text += f" {trials} trials, {at_a_time} at a time, took {minutes:.1f} min and up to "
+        text += f"{about['peak_memory_mb']:.0f} MB a process."
     return text
 
 
-def _groups(records: Sequence[Record], scenes: Mapping[str, str]) -> list[tuple[str, list[Record]]]:
+def _group_by_scene(
+    records: Sequence[Record], scenes: Mapping[str, str]
+) -> list[tuple[str, list[Record]]]:
     """Return name and records of each scene, and of all if there are several."""
     groups = [(name, select(records, scene=scene)) for scene, name in scenes.items()]
-    return [*groups, ("all", list(records))] if len(groups) > 1 else groups
+    if len(groups) > 1:
+        groups.append(("all", list(records)))
+    return groups
 
 
-def _spread(values: Sequence[float]) -> str:
+def _format_quartiles(values: Sequence[float]) -> str:
+    """Format the median of values, with their quartiles; a dash without values."""
+    if not values:
+        return "–"
     first, median, third = compute_quartiles(values)
-    return f"{median:.2f} ({first:.2f}–{third:.2f})" if values else "–"
+    return f"{median:.2f} ({first:.2f}–{third:.2f})"

@@ -6,6 +6,7 @@ leaves room behind it.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -32,7 +33,8 @@ _COLOURS: dict[str, tuple[float, float, float]] = {
     "walnut": (0.45, 0.31, 0.20),
     "white": (0.93, 0.92, 0.89),
 }
-_DENSITY = 500.0  # [kg/m³], wood; hollow bodies are built of their walls
+# [kg/m³], wood; hollow bodies are built of their walls
+_DENSITY = 500.0
 _NO_ROTATION = (0.0, 0.0, 0.0)
 # Roll, pitch and yaw of a cylinder along each axis.
 _CYLINDER_RPY = {
@@ -40,15 +42,24 @@ _CYLINDER_RPY = {
     "y": (math.pi / 2.0, 0.0, 0.0),
     "z": _NO_ROTATION,
 }
-_VELOCITY = {"revolute": 1.0, "prismatic": 0.5}  # [rad/s], [m/s]
-_EFFORT = {"revolute": 30.0, "prismatic": 40.0}  # [N·m], [N]
-_POST = 0.02  # [m] from a bar's ends to the posts that carry it
-_HALF_HAND = 0.03  # [m] from a post to the middle of the hand
-_TILT = 0.6  # [rad] largest tilt of a hand about a bar
-_SWING = 0.8  # [rad] largest rotation about an upright bar, or in any direction about a knob
+# [rad/s], [m/s]
+_VELOCITY = {"revolute": 1.0, "prismatic": 0.5}
+# [N·m], [N]
+_EFFORT = {"revolute": 30.0, "prismatic": 40.0}
+# [m] from a bar's ends to the posts that carry it
+_POST = 0.02
+# [m] from a post to the middle of the hand
+_HALF_HAND = 0.03
+# [rad] largest tilt of a hand about a bar
+_TILT = 0.6
+# [rad] largest rotation about an upright bar, or in any direction about a knob
+_SWING = 0.8
 # [m] height above which a hand approaches horizontally; lower handles obliquely from above
 _LEVEL = 0.55
-_STEEPEST = 0.65  # [rad] largest slope of such an approach
+# [m] below it, the height at which the slope is largest
+_DESCENT = 0.25
+# [rad] largest slope of such an approach
+_STEEPEST = 0.65
 
 
 @dataclass(frozen=True)
@@ -66,9 +77,9 @@ class _Shape:
         if self.kind == "box":
             size = f'size="{_format_numbers(self.size)}"'
         else:
-            size = f'radius="{_format_numbers(self.size[:1])}"' + (
-                f' length="{_format_numbers(self.size[1:])}"' if self.size[1:] else ""
-            )
+            size = f'radius="{_format_numbers(self.size[:1])}"'
+            if self.kind == "cylinder":
+                size += f' length="{_format_numbers(self.size[1:])}"'
         rpy = f' rpy="{_format_numbers(self.rpy, 6)}"' if any(self.rpy) else ""
         material = f"<material name={quoteattr(self.colour)}/>" if element == "visual" else ""
         geometry = f"<geometry><{self.kind} {size}/></geometry>"
@@ -86,8 +97,8 @@ class _Shape:
         else:
             (radius,) = self.size
             own = pin.Inertia.FromSphere(_DENSITY * 4.0 / 3.0 * math.pi * radius**3, radius)
-        where = pin.SE3(pin.rpy.rpyToMatrix(*self.rpy), np.array(self.centre, float))
-        return where.act(own)
+        placement = pin.SE3(pin.rpy.rpyToMatrix(*self.rpy), np.array(self.centre, float))
+        return placement.act(own)
 
 
 @dataclass
@@ -99,8 +110,9 @@ class LinkBuilder:
 
     def add_box(self, low: Point, high: Point, colour: str) -> None:
         """Add a box between two corners."""
-        ends = [*zip(low, high, strict=True)]
-        size, centre = tuple(b - a for a, b in ends), tuple((a + b) / 2.0 for a, b in ends)
+        ends = list(zip(low, high, strict=True))
+        size = tuple(b - a for a, b in ends)
+        centre = tuple((a + b) / 2.0 for a, b in ends)
         self.shapes.append(_Shape("box", size, centre, _NO_ROTATION, colour))
 
     def add_cylinder(
@@ -115,10 +127,10 @@ class LinkBuilder:
         """Add a cylinder between two points."""
         axis = np.subtract(other, one)
         length = float(np.linalg.norm(axis))
-        rpy = (0.0, float(np.arccos(axis[2] / length)), float(np.arctan2(axis[1], axis[0])))
-        self.shapes.append(
-            _Shape("cylinder", (radius, length), tuple(np.add(one, other) / 2.0), rpy, colour)
-        )
+        pitch = float(np.arccos(axis[2] / length))
+        yaw = float(np.arctan2(axis[1], axis[0]))
+        centre = tuple(np.add(one, other) / 2.0)
+        self.shapes.append(_Shape("cylinder", (radius, length), centre, (0.0, pitch, yaw), colour))
 
     def add_sphere(self, centre: Point, radius: float, colour: str) -> None:
         """Add a sphere."""
@@ -126,7 +138,8 @@ class LinkBuilder:
 
     def add_case(self, low: Point, high: Point, wall: float, colour: str, inside: str) -> None:
         """Add a case that is open towards -x: two sides, top, bottom and back."""
-        (x0, y0, z0), (x1, y1, z1) = low, high
+        x0, y0, z0 = low
+        x1, y1, z1 = high
         self.add_box((x0, y0, z0), (x1, y0 + wall, z1), colour)
         self.add_box((x0, y1 - wall, z0), (x1, y1, z1), colour)
         self.add_box((x0, y0 + wall, z1 - wall), (x1, y1 - wall, z1), colour)
@@ -136,20 +149,19 @@ class LinkBuilder:
     def make_xml(self) -> str:
         """Return the URDF element `<link>`, with mass and inertia of the shapes."""
         whole = sum((shape.inertia for shape in self.shapes), pin.Inertia.Zero())
-        entries = " ".join(
-            f'i{"xyz"[i]}{"xyz"[j]}="{_format_numbers([whole.inertia[i, j]], 6)}"'
-            for i in range(3)
-            for j in range(i, 3)
-        )
+        entries: list[str] = []
+        for i, j in itertools.combinations_with_replacement(range(3), 2):
+            moment = _format_numbers([whole.inertia[i, j]], 6)
+            entries.append(f'i{"xyz"[i]}{"xyz"[j]}="{moment}"')
+        inertia = f"<inertia {' '.join(entries)}/>"
         mass = f'<mass value="{_format_numbers([whole.mass])}"/>'
         origin = f'<origin xyz="{_format_numbers(whole.lever)}"/>'
         lines = [
             f"  <link name={quoteattr(self.name)}>",
-            f"    <inertial>{origin}{mass}<inertia {entries}/></inertial>",
+            f"    <inertial>{origin}{mass}{inertia}</inertial>",
         ]
-        lines += [
-            shape.make_xml(element) for element in ("visual", "collision") for shape in self.shapes
-        ]
+        lines += [shape.make_xml("visual") for shape in self.shapes]
+        lines += [shape.make_xml("collision") for shape in self.shapes]
         return "\n".join([*lines, "  </link>"])
 
 
@@ -184,7 +196,8 @@ class ObjectBuilder:
         """Add a joint, and return the link that it moves."""
         child = LinkBuilder(link)
         limits = f'lower="{_format_numbers([lower])}" upper="{_format_numbers([upper])}"'
-        velocity, effort = (_format_numbers([limit[kind]]) for limit in (_VELOCITY, _EFFORT))
+        velocity = _format_numbers([_VELOCITY[kind]])
+        effort = _format_numbers([_EFFORT[kind]])
         rates = f'velocity="{velocity}" effort="{effort}"'
         parent_name = quoteattr(parent or self.base.name)
         lines = [
@@ -208,35 +221,44 @@ class ObjectBuilder:
         **freedom: Any,
     ) -> None:
         """Add an attachment of a link, given in the link's frame; see `Attachment`."""
-        where = {
-            "position": _round_all(position),
-            "approach": _round_all(approach),
-            "closing": _round_all(closing),
-        }
-        self.attachments.append({"name": name, "link": link.name, **where, **freedom})
+        self.attachments.append(
+            {
+                "name": name,
+                "link": link.name,
+                "position": _round_all(position),
+                "approach": _round_all(approach),
+                "closing": _round_all(closing),
+                **freedom,
+            }
+        )
 
     @property
     def urdf(self) -> str:
         """The object as a URDF."""
-        links = [self.base, *(link for link, _ in self.links)]
-        used = sorted({shape.colour for link in links for shape in link.shapes})
-        materials = [
-            f'  <material name="{name}"><color rgba="{colour} 1"/></material>'
-            for name, colour in ((name, _format_numbers(_COLOURS[name])) for name in used)
-        ]
-        parts = [part for link, joint in self.links for part in (joint, link.make_xml())]
-        head = ['<?xml version="1.0"?>', f"<robot name={quoteattr(self.name)}>", *materials]
-        return "\n".join([*head, self.base.make_xml(), *parts, "</robot>"]) + "\n"
+        used = {shape.colour for shape in self.base.shapes}
+        for link, _ in self.links:
+            used.update(shape.colour for shape in link.shapes)
+        lines = ['<?xml version="1.0"?>', f"<robot name={quoteattr(self.name)}>"]
+        for name in sorted(used):
+            colour = _format_numbers(_COLOURS[name])
+            lines.append(f'  <material name="{name}"><color rgba="{colour} 1"/></material>')
+        lines.append(self.base.make_xml())
+        for link, joint in self.links:
+            lines += [joint, link.make_xml()]
+        lines.append("</robot>")
+        return "\n".join(lines) + "\n"
 
     @property
     def description(self) -> dict[str, Any]:
         """The object's description as plain data, including its URDF."""
-        plain = {
+        plain: dict[str, Any] = {
             "urdf": self.urdf,
             "joints": {name: {"acceleration": a} for name, a in self.accelerations.items()},
             "attachments": [_to_plain_data(item) for item in self.attachments],
         }
-        return {**plain, "latches": self.latches} if self.latches else plain
+        if self.latches:
+            plain["latches"] = self.latches
+        return plain
 
 
 class Sampler:
@@ -263,14 +285,17 @@ class Sampler:
 
 
 def _format_numbers(values: Sequence[float] | Floats, digits: int = 4) -> str:
+    """Format rounded numbers, separated by spaces; + 0.0 avoids negative zeros."""
     return " ".join(f"{round(float(value), digits) + 0.0:.10g}" for value in values)
 
 
 def _round_all(values: Point) -> list[float]:
+    """Round numbers; + 0.0 avoids negative zeros."""
     return [round(float(value), 6) + 0.0 for value in values]
 
 
 def _to_plain_data(item: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an item with lists in place of tuples."""
     return {key: list(value) if isinstance(value, tuple) else value for key, value in item.items()}
 
 
@@ -289,9 +314,13 @@ def add_upright_bar(
     middle, reach = _add_posts_and_bar(link, at, length, out, "z")
     where: tuple[LinkBuilder, Point, Point, Point] = (link, middle, (1, 0, 0), (0, 1, 0))
     builder.add_attachment(name, *where)
-    limits, turn = _make_interval(reach), _make_interval(_SWING)
     builder.add_attachment(
-        f"{name}_free", *where, joint="cylindrical", axis=[0, 1, 0], limits=limits, turn=turn
+        f"{name}_free",
+        *where,
+        joint="cylindrical",
+        axis=[0, 1, 0],
+        limits=_make_interval(reach),
+        turn=_make_interval(_SWING),
     )
 
 
@@ -321,9 +350,11 @@ def add_level_bar(
         turn: Range of the hand's rotation about the bar [rad]. Default: its tilt.
     """
     middle, reach = _add_posts_and_bar(link, at, length, out, "y")
-    down = _STEEPEST * float(np.clip((_LEVEL - height) / 0.25, 0.0, 1.0))
-    c, s = math.cos(down), math.sin(down)
-    approach, closing = (c, 0.0, -s), (s, 0.0, c)
+    slope = _STEEPEST * float(np.clip((_LEVEL - height) / _DESCENT, 0.0, 1.0))
+    c = math.cos(slope)
+    s = math.sin(slope)
+    approach = (c, 0.0, -s)
+    closing = (s, 0.0, c)
     where: tuple[LinkBuilder, Point, Point, Point] = (link, middle, approach, closing)
     builder.add_attachment(name, *where)
     limits = list(turn) if turn is not None else _make_interval(_TILT)
@@ -355,9 +386,14 @@ def add_knob(
 def _add_posts_and_bar(
     link: LinkBuilder, at: Point, length: float, out: float, axis: str
 ) -> tuple[Point, float]:
-    """Add a bar along an axis on two posts."""
+    """Add a bar along "y" or "z" on two posts.
+
+    Returns:
+        The bar's middle, and how far the hand may slide from there [m].
+    """
     x, y, z = at
-    middle, end = (x - out, y, z), length / 2.0 - _POST
+    middle = (x - out, y, z)
+    end = length / 2.0 - _POST
     link.add_cylinder(middle, 0.01, length, axis, "steel")
     for shift in (-end, end):
         post = (x - out / 2.0, y, z + shift) if axis == "z" else (x - out / 2.0, y + shift, z)
@@ -366,4 +402,5 @@ def _add_posts_and_bar(
 
 
 def _make_interval(reach: float) -> list[float]:
+    """Return the interval of a reach to both sides."""
     return [-round(reach, 4), round(reach, 4)]

@@ -88,7 +88,8 @@ def write_object(description: Mapping[str, Any], path: str | Path) -> Path:
     Raises:
         InputError: The description is invalid, or a file cannot be written.
     """
-    plain, file = check_mapping(description, "description"), check_path(path, "path")
+    plain = check_mapping(description, "description")
+    file = check_path(path, "path")
     if file.suffix not in (".yaml", ".yml"):
         expected = "a path that ends with .yaml"
         raise InputError("not an object file", field="path", expected=expected, got=file.name)
@@ -96,5 +97,6 @@ def write_object(description: Mapping[str, Any], path: str | Path) -> Path:
     check_writable(file)
     urdf = plain["urdf"]
     if urdf.lstrip().startswith("<"):
-        plain = {**plain, "urdf": write_atomically(file.with_suffix(".urdf"), urdf.encode()).name}
+        urdf_file = write_atomically(file.with_suffix(".urdf"), urdf.encode())
+        plain = {**plain, "urdf": urdf_file.name}
     return write_atomically(file, yaml.safe_dump(plain, sort_keys=False).encode())

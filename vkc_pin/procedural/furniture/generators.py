@@ -15,13 +15,20 @@ from vkc_pin.procedural.furniture.building import (
     add_upright_bar,
 )
 
-_GAP = 0.006  # [m] between a door or drawer and its case
-_POST = 0.05  # [m] width of a door's posts
-_AIR = 0.025  # [m] between a door's panel and its frame: more than a plan's clearance
+# [m] between a door or drawer and its case
+_GAP = 0.006
+# [m] width of a door's posts
+_POST = 0.05
+# [m] between a door's panel and its frame: more than a plan's clearance
+_AIR = 0.025
 _FRONTS = ("white", "shade", "sage", "sand", "slate", "oak", "walnut")
 # [rad] turns of a hand about a bar that moves down or up with its door while the hand stays level
-_DOWN, _UP = (-1.7, 0.5), (-0.5, 1.7)
-_SIDES = 8  # rods that form a hand wheel's rim
+_DOWN = (-1.7, 0.5)
+_UP = (-0.5, 1.7)
+# rods that form a hand wheel's rim
+_SIDES = 8
+# [m] height of a drawer below which a knob, which is grasped horizontally, would be too low
+_MIN_KNOB = 0.55
 
 
 def make_door(sampler: Sampler) -> ObjectBuilder:
@@ -63,7 +70,8 @@ def make_door(sampler: Sampler) -> ObjectBuilder:
     lever = builder.add_joint(
         "knob", "revolute", spindle, (to, 0, 0), 0.8, link="lever", parent="panel", acceleration=4.0
     )
-    out, length = thick / 2 + 0.085, sampler.draw(0.125, 0.145)
+    out = thick / 2 + 0.085
+    length = sampler.draw(0.125, 0.145)
     lever.add_cylinder((0, 0, 0), 0.011, 2 * out, "x", "steel")
     for side in (-1, 1):
         lever.add_cylinder((side * out, -to * (length / 2 - 0.01), 0), 0.012, length, "y", "steel")
@@ -118,32 +126,18 @@ def make_cabinet(sampler: Sampler) -> ObjectBuilder:
     names = ("left", "right") if has_two else (sampler.choose(("left", "right")),)
     upper = sampler.draw(1.7, 1.9)
     for name in names:
-        y = (
-            (0.002, width / 2)
-            if has_two and name == "left"
-            else (-width / 2, -0.002)
-            if has_two
-            else (-width / 2, width / 2)
-        )
-        leaf = _add_leaf(
-            builder,
-            (y[0], y[1], foot, height),
-            0.02,
-            name,
-            f"_{name}" if has_two else "",
-            front,
-            upper,
-        )
-        _add_handle(
-            builder,
-            leaf,
-            (y[1] - y[0], foot, height),
-            0.02,
-            name,
-            grip,
-            (length if bars else 0.0, out),
-            has_two,
-        )
+        y0 = -width / 2
+        y1 = width / 2
+        suffix = ""
+        if has_two:
+            suffix = f"_{name}"
+            if name == "left":
+                y0 = 0.002
+            else:
+                y1 = -0.002
+        leaf = _add_leaf(builder, (y0, y1, foot, height), 0.02, name, suffix, front, upper)
+        bar = (length if bars else 0.0, out)
+        _add_handle(builder, leaf, (y1 - y0, foot, height), 0.02, name, grip, bar, has_two)
     return builder
 
 
@@ -151,7 +145,8 @@ def make_refrigerator(sampler: Sampler) -> ObjectBuilder:
     """Return a refrigerator with one door, a separate freezer, or two doors side by side."""
     kind = sampler.choose(("single", "stacked", "stacked", "side_by_side"))
     width = sampler.draw(0.8, 0.92) if kind == "side_by_side" else sampler.draw(0.55, 0.7)
-    height, depth = sampler.draw(1.5, 1.95), sampler.draw(0.52, 0.64)
+    height = sampler.draw(1.5, 1.95)
+    depth = sampler.draw(0.52, 0.64)
     builder = ObjectBuilder("refrigerator", LinkBuilder("body"))
     colour = sampler.choose(("white", "steel", "slate", "sand"))
     builder.base.add_case((0, -width / 2, 0.05), (depth, width / 2, height), 0.04, colour, "white")
@@ -176,32 +171,27 @@ def make_refrigerator(sampler: Sampler) -> ObjectBuilder:
             (depth - 0.04, width / 2 - 0.04, z + 0.006),
             "glass",
         )
-    low, high = 0.06, height
-    parts = {
-        "single": [("", side, (-width / 2, width / 2, low, high))],
-        "stacked": [
-            ("_upper", side, (-width / 2, width / 2, split + 0.004, high)),
-            ("_lower", side, (-width / 2, width / 2, low, split - 0.004)),
-        ],
-        "side_by_side": [
-            ("_left", "left", (0.003, width / 2, low, high)),
-            ("_right", "right", (-width / 2, -0.003, low, high)),
-        ],
-    }[kind]
-    for suffix, hinge, (y0, y1, z0, z1) in parts:
-        leaf = _add_leaf(builder, (y0, y1, z0, z1), 0.05, hinge, suffix, colour, upper)
-        own = min(length, round(0.5 * (z1 - z0), 3))
-        _add_handle(
-            builder,
-            leaf,
-            (y1 - y0, z0, z1),
-            0.05,
-            hinge,
-            grip,
-            (own, out),
-            bool(suffix),
-            suffix.strip("_"),
-        )
+    low = 0.06
+    half = width / 2
+    # Suffix of the names, side of the hinge, and extent along y and z of each door.
+    if kind == "single":
+        doors = [("", side, (-half, half, low, height))]
+    elif kind == "stacked":
+        doors = [
+            ("_upper", side, (-half, half, split + 0.004, height)),
+            ("_lower", side, (-half, half, low, split - 0.004)),
+        ]
+    else:
+        doors = [
+            ("_left", "left", (0.003, half, low, height)),
+            ("_right", "right", (-half, -0.003, low, height)),
+        ]
+    for suffix, hinge, extent in doors:
+        y0, y1, z0, z1 = extent
+        leaf = _add_leaf(builder, extent, 0.05, hinge, suffix, colour, upper)
+        bar = (min(length, round(0.5 * (z1 - z0), 3)), out)
+        name = suffix.strip("_")
+        _add_handle(builder, leaf, (y1 - y0, z0, z1), 0.05, hinge, grip, bar, bool(suffix), name)
     return builder
 
 
@@ -221,26 +211,13 @@ def make_microwave(sampler: Sampler) -> ObjectBuilder:
     builder.base.add_box((-0.03, -width / 2, 0.02), (depth, edge, height), colour)
     for y in (-width / 2 + 0.04, width / 2 - 0.04):
         builder.base.add_box((0.03, y - 0.02, 0), (depth - 0.03, y + 0.02, 0.02), "dark")  # feet
-    leaf = _add_leaf(
-        builder,
-        (edge + 0.003, width / 2, 0.03, height - 0.005),
-        0.03,
-        "left",
-        "",
-        "glass",
-        sampler.draw(1.6, 1.9),
-    )
+    extent = (edge + 0.003, width / 2, 0.03, height - 0.005)
+    upper = sampler.draw(1.6, 1.9)
+    leaf = _add_leaf(builder, extent, 0.03, "left", "", "glass", upper)
     length = round(min(sampler.draw(0.14, 0.2), height - 0.12), 3)
-    _add_handle(
-        builder,
-        leaf,
-        (width / 2 - edge, 0.03, height),
-        0.03,
-        "left",
-        height / 2,
-        (length, sampler.draw(0.055, 0.065)),
-        False,
-    )
+    bar = (length, sampler.draw(0.055, 0.065))
+    size = (width / 2 - edge, 0.03, height)
+    _add_handle(builder, leaf, size, 0.03, "left", height / 2, bar, False)
     return builder
 
 
@@ -258,15 +235,20 @@ def _add_leaf(
     The door's frame is on the hinge line, at half the door's height.
     """
     y0, y1, z0, z1 = extent
-    right = side == "right"
-    origin = (-_GAP - thick / 2, y0 if right else y1, (z0 + z1) / 2)
-    axis = (0, 0, 1 if right else -1)
+    if side == "right":
+        hinge_y = y0
+        direction = 1  # from the hinge along y
+    else:
+        hinge_y = y1
+        direction = -1
+    origin = (-_GAP - thick / 2, hinge_y, (z0 + z1) / 2)
+    axis = (0, 0, direction)
     link = builder.add_joint(
         f"hinge{suffix}", "revolute", origin, axis, upper, link=f"door{suffix}"
     )
-    ends = sorted((0.0, (y1 - y0) * (1 if right else -1)))
+    low, high = sorted((0.0, (y1 - y0) * direction))
     half = (z1 - z0) / 2
-    link.add_box((-thick / 2, ends[0], -half), (thick / 2, ends[1], half), colour)
+    link.add_box((-thick / 2, low, -half), (thick / 2, high, half), colour)
     return link
 
 
@@ -299,7 +281,8 @@ def make_drawers(sampler: Sampler) -> ObjectBuilder:
     count = sampler.draw_integer(1, 4)
     width = sampler.draw(0.4, 0.9)
     depth = sampler.draw(0.42, 0.6)
-    foot, front = sampler.draw(0.06, 0.1), sampler.draw(0.17, 0.26)
+    foot = sampler.draw(0.06, 0.1)
+    front = sampler.draw(0.17, 0.26)
     # One or two drawers are under the top of a taller case.
     low = foot if count > 2 else sampler.draw(0.35, 0.55)
     height = round(low + count * front + 0.025, 3)
@@ -316,30 +299,45 @@ def make_drawers(sampler: Sampler) -> ObjectBuilder:
     bars = sampler.flip(0.7)
     length = min(sampler.draw(0.14, 0.3), width - 0.12)
     out = sampler.draw(0.055, 0.075)
-    own, reach = sampler.choose(_FRONTS), round(sampler.draw(0.6, 0.8) * depth, 3)
+    front_colour = sampler.choose(_FRONTS)
+    reach = round(sampler.draw(0.6, 0.8) * depth, 3)
     for k in range(count):
         name = "" if count == 1 else f"_{k + 1}"
         middle = height - 0.025 - (k + 0.5) * front
         tray = builder.add_joint(
             f"slide{name}", "prismatic", (0, 0, middle), (-1, 0, 0), reach, link=f"drawer{name}"
         )
-        half, side = front / 2 - 0.003, width / 2 - 0.03
-        tray.add_box(
-            (-_GAP - 0.018, -width / 2 + 0.002, -half), (-_GAP, width / 2 - 0.002, half), own
-        )
-        bottom, top, back = -half + 0.02, half - 0.03, depth - 0.05
-        tray.add_box((-_GAP, -side, bottom), (back, -side + 0.012, top), "oak")
-        tray.add_box((-_GAP, side - 0.012, bottom), (back, side, top), "oak")
-        tray.add_box((back - 0.012, -side + 0.012, bottom), (back, side - 0.012, top), "oak")
-        tray.add_box(
-            (-_GAP, -side + 0.012, bottom), (back - 0.012, side - 0.012, bottom + 0.008), "oak"
-        )
+        _add_tray(tray, (depth, width, front), front_colour)
         at = (-_GAP - 0.018, 0.0, 0.0)
-        if bars or middle < 0.55:  # a knob is grasped horizontally
+        if bars or middle < _MIN_KNOB:
             add_level_bar(builder, tray, at, length, out, height=middle, name=f"handle{name}")
         else:
             add_knob(builder, tray, at, out, f"handle{name}")
     return builder
+
+
+def _add_tray(tray: LinkBuilder, size: tuple[float, float, float], colour: str) -> None:
+    """Add a drawer's front, two sides, back and bottom.
+
+    Args:
+        tray: Link of the drawer, whose frame is in the middle of its front.
+        size: Depth and width of the case, and height of the front [m].
+        colour: Colour of the front.
+    """
+    depth, width, front = size
+    half = front / 2 - 0.003
+    tray.add_box(
+        (-_GAP - 0.018, -width / 2 + 0.002, -half), (-_GAP, width / 2 - 0.002, half), colour
+    )
+    side = width / 2 - 0.03
+    inner = side - 0.012
+    bottom = -half + 0.02
+    top = half - 0.03
+    back = depth - 0.05
+    tray.add_box((-_GAP, -side, bottom), (back, -inner, top), "oak")
+    tray.add_box((-_GAP, inner, bottom), (back, side, top), "oak")
+    tray.add_box((back - 0.012, -inner, bottom), (back, inner, top), "oak")
+    tray.add_box((-_GAP, -inner, bottom), (back - 0.012, inner, bottom + 0.008), "oak")
 
 
 def make_dishwasher(sampler: Sampler) -> ObjectBuilder:
@@ -384,15 +382,16 @@ def make_chest(sampler: Sampler) -> ObjectBuilder:
     depth = sampler.draw(0.42, 0.58)
     height = sampler.draw(0.45, 0.7)
     builder = ObjectBuilder("chest", LinkBuilder("body"))
-    colour, wall, thick = sampler.choose(_FRONTS), 0.025, 0.035
-    for low, high in (
-        ((0, -width / 2, 0), (wall, width / 2, height)),
-        ((depth - wall, -width / 2, 0), (depth, width / 2, height)),
-        ((wall, -width / 2, 0), (depth - wall, -width / 2 + wall, height)),
-        ((wall, width / 2 - wall, 0), (depth - wall, width / 2, height)),
-        ((wall, -width / 2 + wall, 0), (depth - wall, width / 2 - wall, wall)),
-    ):
-        builder.base.add_box(low, high, colour)
+    colour = sampler.choose(_FRONTS)
+    wall = 0.025
+    thick = 0.035  # of the lid
+    base = builder.base
+    half = width / 2
+    base.add_box((0, -half, 0), (wall, half, height), colour)
+    base.add_box((depth - wall, -half, 0), (depth, half, height), colour)
+    base.add_box((wall, -half, 0), (depth - wall, -half + wall, height), colour)
+    base.add_box((wall, half - wall, 0), (depth - wall, half, height), colour)
+    base.add_box((wall, -half + wall, 0), (depth - wall, half - wall, wall), colour)
     # The open lid does not reach beyond the chest's back.
     hinge = (depth - 0.06, 0.0, height + _GAP + thick)
     lid = builder.add_joint("lid", "revolute", hinge, (0, 1, 0), sampler.draw(1.2, 1.4), link="lid")
@@ -446,19 +445,29 @@ def make_faucet(sampler: Sampler) -> ObjectBuilder:
     builder = ObjectBuilder("faucet", LinkBuilder("spout"))
     height = sampler.draw(0.16, 0.24)
     reach = sampler.draw(0.14, 0.2)
-    two = sampler.flip(0.4)
+    has_two = sampler.flip(0.4)
     builder.base.add_cylinder((0, 0, height / 2), 0.022, height, "z", "steel")
-    names = (("_left", 0.14), ("_right", -0.14)) if two else (("", 0.0),)
-    low = sampler.draw(0.12, 0.16) if two else round(height + 0.03, 3)
-    builder.base.add_cylinder(
-        (-reach / 2, 0, height - 0.015 if two else height - 0.06), 0.012, reach, "x", "steel"
-    )
-    # The hand stays in front of the spout.
-    length = sampler.draw(0.11, 0.16) + (0.0 if two else max(reach - 0.1, 0.0))
-    for suffix, y in names:
-        if two:
+    # Suffix of the names, and y, of each lever; their height, their range, and the spout's height.
+    levers: tuple[tuple[str, float], ...]
+    if has_two:
+        levers = (("_left", 0.14), ("_right", -0.14))
+        low = sampler.draw(0.12, 0.16)
+        lower = 0.0
+        upper = 1.2
+        spout = height - 0.015
+    else:
+        levers = (("", 0.0),)
+        low = round(height + 0.03, 3)
+        lower = -0.8
+        upper = 0.8
+        spout = height - 0.06
+    builder.base.add_cylinder((-reach / 2, 0, spout), 0.012, reach, "x", "steel")
+    length = sampler.draw(0.11, 0.16)
+    if not has_two:  # the hand stays in front of the spout
+        length += max(reach - 0.1, 0.0)
+    for suffix, y in levers:
+        if has_two:
             builder.base.add_cylinder((0, y, low / 2 - 0.01), 0.018, low - 0.02, "z", "steel")
-        lower, upper = (0.0, 1.2) if two else (-0.8, 0.8)
         axis = (0, 0, -1 if y > 0.0 else 1)  # two levers turn away from the spout
         lever = builder.add_joint(
             f"turn{suffix}",
@@ -498,7 +507,8 @@ def make_valve(sampler: Sampler) -> ObjectBuilder:
     if sampler.flip(0.5):
         length = sampler.draw(0.16, 0.24)
         turned.add_box((-0.006, -0.011, 0.0), (0.006, 0.011, length), "sage")
-        held, closing = (0.0, 0.0, length - 0.03), (0, 1, 0)
+        held = (0.0, 0.0, length - 0.03)
+        closing = (0, 1, 0)
         bend: dict[str, object] = {"joint": "revolute", "axis": [1, 0, 0], "limits": [-0.5, 0.5]}
     else:
         radius = sampler.draw(0.11, 0.17)

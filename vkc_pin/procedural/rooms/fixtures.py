@@ -37,9 +37,12 @@ The robot and the object's doors need it.
 RANDOM = "random_"
 """Prefix of the types of random objects: `random_oven`."""
 _IN_WALL = ("door", "narrow_door", "wide_door")
-_BESIDE = 0.7  # [m] as in `OPENABLE`, for objects known by their description only
-_SLIT = 0.03  # [m] above a door's panel, if its frame has no lintel
-_ON = 0.001  # [m] between an object and the counter
+# [m] as in `OPENABLE`, for objects known by their description only
+_BESIDE = 0.7
+# [m] above a door's panel, if its frame has no lintel
+_SLIT = 0.03
+# [m] between an object and the counter
+_ON = 0.001
 
 
 @dataclass(frozen=True)
@@ -83,11 +86,9 @@ class Fixture:
 
 def list_openable_types() -> list[str]:
     """Return the names of all types of objects that can be opened."""
-    return [
-        *OPENABLE,
-        *(RANDOM + kind for kind in KINDS),
-        *(name for name in list_resources("scenes", "objects/*.yaml") if name not in OPENABLE),
-    ]
+    random = [RANDOM + kind for kind in KINDS]
+    described = list_resources("scenes", "objects/*.yaml")
+    return [*OPENABLE, *random, *(name for name in described if name not in OPENABLE)]
 
 
 def make_fixture_name(kind: str | Mapping[str, Any]) -> str:
@@ -99,22 +100,23 @@ def make_fixture_name(kind: str | Mapping[str, Any]) -> str:
 
 def make_fixture(kind: str | Mapping[str, Any], seed: int = 0) -> Fixture:
     """Return an object that can be opened."""
-    if isinstance(kind, str) and kind.startswith(RANDOM):
-        if kind.removeprefix(RANDOM) not in KINDS:
+    if not isinstance(kind, str):
+        return _make_described_fixture(dict(kind), load_object(kind))
+    if kind.startswith(RANDOM):
+        name = kind.removeprefix(RANDOM)
+        if name not in KINDS:
             raise UnknownNameError(
                 "object that opens", kind, list_openable_types(), field="objects"
             )
-        return _make_random_fixture(kind.removeprefix(RANDOM), seed)
-    if isinstance(kind, str) and not _is_path(kind):
-        return _make_named_fixture(kind)
-    own = load_object(kind)
-    return _make_described_fixture(
-        str(Path(kind).resolve()) if isinstance(kind, str) else dict(kind), own
-    )
+        return _make_random_fixture(name, seed)
+    if _is_path(kind):
+        return _make_described_fixture(str(Path(kind).resolve()), load_object(kind))
+    return _make_named_fixture(kind)
 
 
 @functools.cache
 def _make_named_fixture(kind: str) -> Fixture:
+    """Return an object of the package; cached."""
     if kind not in list_openable_types():
         raise UnknownNameError("object that opens", kind, list_openable_types(), field="objects")
     own = load_object(kind)
@@ -137,53 +139,66 @@ def _make_described_fixture(kind: str | dict[str, Any], own: ArticulatedObject) 
             got=own.name,
         )
     low, high = _compute_extent(own, in_wall=False)
-    fixed = [
-        compute_world_box(shape.geometry, shape.placement)[0]
-        for shape in own.collision.geometryObjects
-        if shape.parentJoint == 0
-    ]
-    face = min((float(lowest[0]) for lowest in fixed), default=float(low[0]))
-    return Fixture(
-        kind, low, high, False, _BESIDE, lift=round(float(-low[2]), 4), face=round(face, 4)
-    )
+    fronts: list[float] = []  # of the shapes of the fixed part
+    for shape in own.collision.geometryObjects:
+        if shape.parentJoint == 0:
+            lower, _ = compute_world_box(shape.geometry, shape.placement)
+            fronts.append(float(lower[0]))
+    face = min(fronts, default=float(low[0]))
+    lift = float(-low[2])
+    return Fixture(kind, low, high, False, _BESIDE, lift=round(lift, 4), face=round(face, 4))
 
 
 def _make_random_fixture(kind: str, seed: int) -> Fixture:
-    own, about = random_object(kind, seed), KINDS[kind]
-    low, high = _compute_extent(load_object(own), in_wall=about.place == "wall")
+    """Return an object of random sizes, on a random counter if it needs one."""
+    description = random_object(kind, seed)
+    about = KINDS[kind]
+    in_wall = about.place == "wall"
+    low, high = _compute_extent(load_object(description), in_wall=in_wall)
     counter = None
+    lift = 0.0
     if about.place == "counter":
-        rng = np.random.default_rng([5, seed])
-        before, extra, width, height = (
-            float(rng.uniform(*interval))
-            for interval in ((0.01, 0.06), (0.0, 0.1), (0.2, 0.8), (0.72, 0.9))
-        )
-        # No part of it, levers and handles included, is beyond the counter's edge.
-        setback = float(-low[0]) + before
-        depth = max(0.5, setback + float(high[0]) + 0.02) + extra
-        sizes = [
-            math.ceil(100.0 * size) / 100.0 for size in (depth, high[1] - low[1] + width, height)
-        ]
-        counter = Counter((sizes[0], sizes[1], sizes[2]), round(setback, 3))
-    return Fixture(
-        own, low, high, about.place == "wall", about.beside, _ON if counter else 0.0, counter
-    )
+        counter = _sample_counter(low, high, seed)
+        lift = _ON
+    return Fixture(description, low, high, in_wall, about.beside, lift, counter)
+
+
+def _sample_counter(low: Floats, high: Floats, seed: int) -> Counter:
+    """Return a random counter for an object between two corners, shape (3,) each [m]."""
+    rng = np.random.default_rng([5, seed])
+    before = float(rng.uniform(0.01, 0.06))
+    behind = float(rng.uniform(0.0, 0.1))
+    beside = float(rng.uniform(0.2, 0.8))
+    height = float(rng.uniform(0.72, 0.9))
+    # No part of it, levers and handles included, is beyond the counter's edge.
+    setback = float(-low[0]) + before
+    depth = max(0.5, setback + float(high[0]) + 0.02) + behind
+    width = high[1] - low[1] + beside
+    size = (_round_up(depth), _round_up(width), _round_up(height))
+    return Counter(size, round(setback, 3))
+
+
+def _round_up(size: float) -> float:
+    """Round a length up to the centimetre [m]."""
+    return math.ceil(100.0 * size) / 100.0
 
 
 def _is_path(kind: str) -> bool:
+    """Return whether a type is the path of an object's file."""
     return kind.endswith((".yaml", ".yml")) or "/" in kind
 
 
 def _compute_extent(own: ArticulatedObject, *, in_wall: bool) -> tuple[Floats, Floats]:
     """Return lowest and highest corner, shape (3,) each [m]; see `Fixture`."""
     placed = PlacedObject("it", own, pin.SE3.Identity(), np.clip(0.0, own.lower, own.upper))
-    boxes = np.array(
-        [compute_world_box(shape.geometry, shape.placement) for shape in make_world_shapes(placed)]
-    )
-    low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+    shapes = make_world_shapes(placed)
+    boxes = np.array([compute_world_box(shape.geometry, shape.placement) for shape in shapes])
+    low = boxes[:, 0].min(axis=0)
+    high = boxes[:, 1].max(axis=0)
     if in_wall:
-        fixed = [shape.parentJoint == 0 for shape in own.collision.geometryObjects]
-        top = max(boxes[fixed, 1].max(axis=0)[2], high[2] + _SLIT)
-        low, high = boxes[fixed, 0].min(axis=0), boxes[fixed, 1].max(axis=0)
-        high[2] = top
+        panel_top = high[2]
+        is_frame = [shape.parentJoint == 0 for shape in own.collision.geometryObjects]
+        low = boxes[is_frame, 0].min(axis=0)
+        high = boxes[is_frame, 1].max(axis=0)
+        high[2] = max(high[2], panel_top + _SLIT)
     return low.round(4), high.round(4)

@@ -11,7 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from vkc_pin.utils.arrays import Floats
 
-_CELL = 0.1  # [m] of the grid for path searches
+# [m] of the grid for path searches
+_CELL = 0.1
+# Directions of the sides east, north, west and south.
 _QUARTERS = ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))
 
 
@@ -34,23 +36,24 @@ class Rectangle:
     @property
     def axes(self) -> Floats:
         """Directions of its edges as rows, shape (2, 2)."""
-        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        c = math.cos(self.yaw)
+        s = math.sin(self.yaw)
         return np.array([[c, s], [-s, c]])
 
     @property
     def corners(self) -> Floats:
         """Its corners in the world frame, shape (4, 2) [m]."""
         signs = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
-        return (
-            np.array([self.x, self.y]) + signs * (self.length / 2.0, self.width / 2.0) @ self.axes
-        )
+        local = signs * (self.length / 2.0, self.width / 2.0)
+        return np.array([self.x, self.y]) + local @ self.axes
 
     def compute_gap(self, other: Rectangle) -> float:
         """Return the largest separation of two rectangles along an axis [m]; negative: overlap."""
-        gaps = []
+        gaps: list[float] = []
         for axis in np.vstack([self.axes, other.axes]):
-            one, two = self.corners @ axis, other.corners @ axis
-            gaps.append(max(one.min() - two.max(), two.min() - one.max()))
+            own = self.corners @ axis
+            others = other.corners @ axis
+            gaps.append(max(own.min() - others.max(), others.min() - own.max()))
         return float(max(gaps))
 
     def compute_distances(self, points: ArrayLike) -> Floats:
@@ -59,9 +62,8 @@ class Rectangle:
         They are 0 inside.
         """
         local = np.abs((np.asarray(points, float) - (self.x, self.y)) @ self.axes.T)
-        return np.linalg.norm(
-            np.maximum(local - (self.length / 2.0, self.width / 2.0), 0.0), axis=-1
-        )
+        outside = np.maximum(local - (self.length / 2.0, self.width / 2.0), 0.0)
+        return np.linalg.norm(outside, axis=-1)
 
 
 @dataclass(frozen=True)
@@ -77,13 +79,18 @@ class Frame:
 
     def transform_point(self, x: float, y: float) -> tuple[float, float]:
         """Return a point of this frame in the world frame, rounded to the millimetre [m]."""
-        c, s = math.cos(self.yaw), math.sin(self.yaw)
-        return round(self.x + c * x - s * y, 3), round(self.y + s * x + c * y, 3)
+        c = math.cos(self.yaw)
+        s = math.sin(self.yaw)
+        world_x = self.x + c * x - s * y
+        world_y = self.y + s * x + c * y
+        return round(world_x, 3), round(world_y, 3)
 
     def make_rectangle(self, x: tuple[float, float], y: tuple[float, float]) -> Rectangle:
         """Return the rectangle between two values of x and two values of y in this frame [m]."""
-        centre = self.transform_point((x[0] + x[1]) / 2.0, (y[0] + y[1]) / 2.0)
-        return Rectangle(*centre, x[1] - x[0], y[1] - y[0], self.yaw)
+        x_min, x_max = x
+        y_min, y_max = y
+        centre = self.transform_point((x_min + x_max) / 2.0, (y_min + y_max) / 2.0)
+        return Rectangle(*centre, x_max - x_min, y_max - y_min, self.yaw)
 
 
 @dataclass(frozen=True)
@@ -110,9 +117,8 @@ class Floor:
 
     def contains(self, rectangle: Rectangle) -> bool:
         """Return whether a rectangle lies between the walls."""
-        return bool(
-            (np.abs(rectangle.corners) <= np.array([self.width, self.depth]) / 2.0 + 1e-6).all()
-        )
+        half = np.array([self.width, self.depth]) / 2.0
+        return bool((np.abs(rectangle.corners) <= half + 1e-6).all())
 
     def find_free(
         self, standing: Sequence[Rectangle], radius: float, points: ArrayLike
@@ -125,12 +131,12 @@ class Floor:
             points: Positions of its centre, shape (n, 2) [m].
         """
         points = np.asarray(points, float)
-        free = np.asarray(
-            (np.array([self.width, self.depth]) / 2.0 - np.abs(points)).min(axis=1) >= radius
-        )
+        half = np.array([self.width, self.depth]) / 2.0
+        to_walls = (half - np.abs(points)).min(axis=1)
+        is_free = np.asarray(to_walls >= radius)
         for rectangle in standing:
-            free &= rectangle.compute_distances(points) >= radius
-        return free
+            is_free &= rectangle.compute_distances(points) >= radius
+        return is_free
 
     def is_connected(
         self, standing: Sequence[Rectangle], radius: float, places: Sequence[tuple[float, float]]
@@ -144,17 +150,14 @@ class Floor:
         """
         from scipy.ndimage import label
 
-        ticks = [
-            np.arange(-size / 2.0, size / 2.0 + _CELL, _CELL) for size in (self.width, self.depth)
-        ]
-        cells = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1)
-        free = self.find_free(standing, radius, cells.reshape(-1, 2)).reshape(cells.shape[:2])
-        regions, _ = label(free)
-        found_regions = set()
-        for place in places:
-            i, j = (
-                int(np.argmin(np.abs(axis - value)))
-                for axis, value in zip(ticks, place, strict=True)
-            )
-            found_regions.add(int(regions[i, j]))
-        return 0 not in found_regions and len(found_regions) <= 1
+        xs = np.arange(-self.width / 2.0, self.width / 2.0 + _CELL, _CELL)
+        ys = np.arange(-self.depth / 2.0, self.depth / 2.0 + _CELL, _CELL)
+        points = np.stack(np.meshgrid(xs, ys, indexing="ij"), axis=-1).reshape(-1, 2)
+        is_free = self.find_free(standing, radius, points).reshape(len(xs), len(ys))
+        regions, _ = label(is_free)  # 0 where the disc collides
+        occupied = set[int]()
+        for x, y in places:
+            i = int(np.argmin(np.abs(xs - x)))
+            j = int(np.argmin(np.abs(ys - y)))
+            occupied.add(int(regions[i, j]))
+        return 0 not in occupied and len(occupied) <= 1

@@ -11,12 +11,20 @@ import numpy as np
 from vkc_pin.procedural.rooms.fixtures import Fixture
 from vkc_pin.procedural.rooms.footprints import Floor, Frame, Rectangle
 
-WALL = 0.1  # [m] thickness
-AIR = 0.02  # [m] between a wall and the parts against it
-PLATE, LEG, BOARD = 0.03, 0.06, 0.02  # [m] thicknesses
-BEFORE_TABLE = 1.5  # [m] depth of the free floor on one side of a table
-_MIN_HALF_WIDTH = 0.75  # [m] of the free floor in front of a table, for a robot to turn
-_ON = 0.001  # [m] between a free object and its table
+# [m] thickness
+WALL = 0.1
+# [m] between a wall and the parts against it
+AIR = 0.02
+# [m] thicknesses
+PLATE = 0.03
+LEG = 0.06
+BOARD = 0.02
+# [m] depth of the free floor on one side of a table
+BEFORE_TABLE = 1.5
+# [m] of the free floor in front of a table, for a robot to turn
+_MIN_HALF_WIDTH = 0.75
+# [m] between a free object and its table
+_ON = 0.001
 
 CARRIED = {"cup": 0.0, "ball": 0.035}
 """Types of free objects for tables → height of their frame above the table [m]."""
@@ -51,12 +59,8 @@ class Part:
 def make_box(name: str, frame: Frame, size: Sequence[float], colour: str) -> Part:
     """Return a box on the floor, centred at the frame's origin."""
     footprint = Rectangle(frame.x, frame.y, size[0], size[1], frame.yaw)
-    return Part(
-        name,
-        frame,
-        footprint,
-        (_make_box_entry(name, frame, (0.0, 0.0), (0.0, size[2]), size[:2], colour),),
-    )
+    entry = _make_box_entry(name, frame, (0.0, 0.0), (0.0, size[2]), size[:2], colour)
+    return Part(name, frame, footprint, (entry,))
 
 
 def make_table(name: str, frame: Frame, size: tuple[float, float, float]) -> Part:
@@ -70,21 +74,17 @@ def make_table(name: str, frame: Frame, size: tuple[float, float, float]) -> Par
         size: Depth along x, width along y, height [m].
     """
     depth, width, height = size
-    items = [
-        _make_box_entry(
-            f"{name}_top", frame, (0.0, 0.0), (height - PLATE, height), (depth, width), "oak"
-        )
-    ]
+    below = height - PLATE
+    top = _make_box_entry(f"{name}_top", frame, (0.0, 0.0), (below, height), (depth, width), "oak")
+    items = [top]
     for k, (x, y) in enumerate(((-1, -1), (-1, 1), (1, -1), (1, 1)), start=1):
         at = (x * (depth - LEG) / 2.0, y * (width - LEG) / 2.0)
-        items.append(
-            _make_box_entry(
-                f"{name}_leg_{k}", frame, at, (0.0, height - PLATE), (LEG, LEG), "walnut"
-            )
-        )
-    half, side = depth / 2.0, max(width / 2.0, _MIN_HALF_WIDTH)
-    clear_floor = frame.make_rectangle((-half - BEFORE_TABLE, -half), (-side, side))
-    standing_place = frame.transform_point(-half - BEFORE_TABLE / 2.0, 0.0)
+        leg = _make_box_entry(f"{name}_leg_{k}", frame, at, (0.0, below), (LEG, LEG), "walnut")
+        items.append(leg)
+    front = -depth / 2.0
+    side = max(width / 2.0, _MIN_HALF_WIDTH)
+    clear_floor = frame.make_rectangle((front - BEFORE_TABLE, front), (-side, side))
+    standing_place = frame.transform_point(front - BEFORE_TABLE / 2.0, 0.0)
     footprint = Rectangle(frame.x, frame.y, depth, width, frame.yaw)
     return Part(
         name,
@@ -100,30 +100,22 @@ def make_table(name: str, frame: Frame, size: tuple[float, float, float]) -> Par
 def make_shelf(name: str, frame: Frame, size: tuple[float, float, float], boards: int) -> Part:
     """Return an open shelf with two sides, a back and boards, its back against a wall."""
     depth, width, height = size
-    middle = -AIR - depth / 2.0
+    full_height = (0.0, height)
+    behind = -AIR - BOARD / 2.0
+    middle = -AIR - depth / 2.0 - BOARD / 2.0  # of sides and boards, which are before the back
     back = _make_box_entry(
-        f"{name}_back", frame, (-AIR - BOARD / 2.0, 0.0), (0.0, height), (BOARD, width), "walnut"
+        f"{name}_back", frame, (behind, 0.0), full_height, (BOARD, width), "walnut"
     )
     items = [back]
     for k, y in enumerate((-1, 1), start=1):
-        at = (middle - BOARD / 2.0, y * (width - BOARD) / 2.0)
-        items.append(
-            _make_box_entry(
-                f"{name}_side_{k}", frame, at, (0.0, height), (depth - BOARD, BOARD), "walnut"
-            )
-        )
+        at = (middle, y * (width - BOARD) / 2.0)
+        extent = (depth - BOARD, BOARD)
+        side = _make_box_entry(f"{name}_side_{k}", frame, at, full_height, extent, "walnut")
+        items.append(side)
+    inside = (depth - BOARD, width - 2.0 * BOARD)
     for k, low in enumerate(np.linspace(0.06, height - BOARD, boards).tolist(), start=1):
-        inside = (depth - BOARD, width - 2.0 * BOARD)
-        items.append(
-            _make_box_entry(
-                f"{name}_board_{k}",
-                frame,
-                (middle - BOARD / 2.0, 0.0),
-                (low, low + BOARD),
-                inside,
-                "oak",
-            )
-        )
+        z = (low, low + BOARD)
+        items.append(_make_box_entry(f"{name}_board_{k}", frame, (middle, 0.0), z, inside, "oak"))
     footprint = frame.make_rectangle((-AIR - depth, -AIR), (-width / 2.0, width / 2.0))
     return Part(name, frame, footprint, tuple(items), size=size)
 
@@ -135,35 +127,44 @@ def make_openable(
 
     The floor in front of it stays free.
     """
-    low, high, counter = own.low, own.high, own.counter
+    low = own.low
+    high = own.high
+    counter = own.counter
     middle = (low[1] + high[1]) / 2.0
     wall = floor.make_wall_frame(side, along - middle)
-    edge = -AIR - counter.size[0] if counter else 0.0  # of the counter, along the wall's frame
-    offset = WALL / 2.0 if own.in_wall else edge + counter.setback if counter else -AIR - high[0]
+    # x of the object's frame in the wall's frame, which points out of the room
+    if own.in_wall:
+        offset = WALL / 2.0
+    elif counter:
+        offset = -AIR - counter.size[0] + counter.setback
+    else:
+        offset = -AIR - high[0]
     frame = Frame(*wall.transform_point(offset, 0.0), wall.yaw)
-    sides, face = (low[1], high[1]), -WALL / 2.0 if own.in_wall else own.face
-    footprint, items, up = frame.make_rectangle((low[0], high[0]), sides), [], own.lift
+    items: list[dict[str, Any]] = []
     if counter:
         depth, width, height = counter.size
-        sides = (middle - width / 2.0, middle + width / 2.0)
         face = -counter.setback
-        up = height + own.lift
-        footprint = frame.make_rectangle((face, face + depth), sides)
+        z = height + own.lift
+        footprint = frame.make_rectangle(
+            (face, face + depth), (middle - width / 2.0, middle + width / 2.0)
+        )
         centre = (face + depth / 2.0, middle)
+        below = (0.0, height - PLATE)
+        plate = (height - PLATE, height)
         items = [
-            _make_box_entry(
-                f"{name}_counter", frame, centre, (0.0, height - PLATE), (depth, width), "cream"
-            ),
-            _make_box_entry(
-                f"{name}_worktop", frame, centre, (height - PLATE, height), (depth, width), "oak"
-            ),
+            _make_box_entry(f"{name}_counter", frame, centre, below, (depth, width), "cream"),
+            _make_box_entry(f"{name}_worktop", frame, centre, plate, (depth, width), "oak"),
         ]
+    else:
+        face = -WALL / 2.0 if own.in_wall else own.face
+        z = own.lift
+        footprint = frame.make_rectangle((low[0], high[0]), (low[1], high[1]))
     y_range = (low[1] - own.beside, high[1] + own.beside)
     clear_floor = frame.make_rectangle((face - front, face), y_range)
     entry = {
         "name": name,
         "type": own.type,
-        "position": [frame.x, frame.y, round(up, 4)],
+        "position": [frame.x, frame.y, round(z, 4)],
         "yaw": frame.yaw,
     }
     standing_place = frame.transform_point(face - front / 2.0, middle)
@@ -183,13 +184,10 @@ def make_openable(
 
 def make_carried_object(name: str, kind: str, on: Part, x: float, y: float) -> Part:
     """Return a free object on a table."""
-    place = on.frame.transform_point(x, y)
-    entry = {
-        "name": name,
-        "type": kind,
-        "position": [*place, round(on.size[2] + CARRIED[kind] + _ON, 3)],
-    }
-    return Part(name, Frame(*place, 0.0), on.footprint, (), (entry,))
+    world_x, world_y = on.frame.transform_point(x, y)
+    z = round(on.size[2] + CARRIED[kind] + _ON, 3)
+    entry = {"name": name, "type": kind, "position": [world_x, world_y, z]}
+    return Part(name, Frame(world_x, world_y, 0.0), on.footprint, (), (entry,))
 
 
 def make_walls(floor: Floor, height: float, parts: Sequence[Part]) -> list[dict[str, Any]]:
@@ -200,47 +198,56 @@ def make_walls(floor: Floor, height: float, parts: Sequence[Part]) -> list[dict[
         height: Height of the walls [m].
         parts: Parts of the room, of which the doors have a `side`.
     """
-    items = []
+    items: list[dict[str, Any]] = []
     for side, name in enumerate(("east", "north", "west", "south")):
-        half, frame = floor.compute_half_length(side), floor.make_wall_frame(side, 0.0)
-        end = half + WALL if side % 2 else half  # the walls north and south include the corners
-        begin, own = -end, f"wall_{name}"
-        centres = {
-            part.name: _project_along(frame, part.footprint) for part in parts if part.side == side
-        }
-        doors = sorted(
-            (part for part in parts if part.side == side), key=lambda part: centres[part.name]
-        )
-        for k, door in enumerate(doors, start=1):
-            middle, width = centres[door.name], door.size[1]
-            low, high, top = middle - width / 2.0, middle + width / 2.0, door.size[2]
-            items.append(_make_wall(f"{own}_{k}", frame, (begin, low), (0.0, height)))
-            if top < height:
-                items.append(
-                    _make_wall(f"{own}_above_{door.name}", frame, (low, high), (top, height))
-                )
-            begin = high
-        items.append(
-            _make_wall(
-                f"{own}_{len(doors) + 1}" if doors else own, frame, (begin, end), (0.0, height)
-            )
-        )
+        doors = [part for part in parts if part.side == side]
+        items += _make_wall_with_doors(f"wall_{name}", floor, side, height, doors)
+    return items
+
+
+def _make_wall_with_doors(
+    name: str, floor: Floor, side: int, height: float, doors: Sequence[Part]
+) -> list[dict[str, Any]]:
+    """Return the pieces of a wall: beside its doors, and above them."""
+    frame = floor.make_wall_frame(side, 0.0)
+    end = floor.compute_half_length(side)
+    if side % 2:
+        end += WALL  # the walls north and south include the corners
+    full_height = (0.0, height)
+    centres = {door.name: _project_along(frame, door.footprint) for door in doors}
+    items: list[dict[str, Any]] = []
+    begin = -end
+    for k, door in enumerate(sorted(doors, key=lambda door: centres[door.name]), start=1):
+        middle = centres[door.name]
+        _, width, top = door.size
+        low = middle - width / 2.0
+        high = middle + width / 2.0
+        items.append(_make_wall(f"{name}_{k}", frame, (begin, low), full_height))
+        if top < height:
+            items.append(_make_wall(f"{name}_above_{door.name}", frame, (low, high), (top, height)))
+        begin = high
+    last = f"{name}_{len(doors) + 1}" if doors else name
+    items.append(_make_wall(last, frame, (begin, end), full_height))
     return items
 
 
 def _make_wall(
     name: str, frame: Frame, along: tuple[float, float], z: tuple[float, float]
 ) -> dict[str, Any]:
-    return _make_box_entry(
-        name, frame, (WALL / 2.0, sum(along) / 2.0), z, (WALL, along[1] - along[0]), "wall"
-    )
+    """Return a piece of a wall as an entry of a scene."""
+    begin, end = along
+    centre = (WALL / 2.0, (begin + end) / 2.0)
+    return _make_box_entry(name, frame, centre, z, (WALL, end - begin), "wall")
 
 
 def _project_along(frame: Frame, rectangle: Rectangle) -> float:
-    """Return the position of a rectangle's centre along a frame's y [m]."""
-    return float(
-        -np.sin(frame.yaw) * (rectangle.x - frame.x) + np.cos(frame.yaw) * (rectangle.y - frame.y)
-    )
+    """Return the position of a rectangle's centre along a frame's y [m].
+
+    With the frame's heading θ, y points along (−sin θ, cos θ).
+    """
+    dx = rectangle.x - frame.x
+    dy = rectangle.y - frame.y
+    return float(-np.sin(frame.yaw) * dx + np.cos(frame.yaw) * dy)
 
 
 def _make_box_entry(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -38,16 +39,25 @@ from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene
 
-_MAX_CARRIED = 4  # on one table
-_MAX_TRIES = 60  # places for one part
-_MAX_ROOMS = 60  # rooms that are started because a part of the one before did not fit
-_MAX_STARTS = 1000  # places for the robot
+# on one table
+_MAX_CARRIED = 4
+# places for one part
+_MAX_TRIES = 60
+# rooms that are started because a part of the one before did not fit
+_MAX_ROOMS = 60
+# places for the robot
+_MAX_STARTS = 1000
 # [m] around a turning robot: more than a plan's clearance and half a grid cell
 _TURNING = 0.07
-_DENSITY = 0.45  # pieces of furniture per square metre of floor at clutter 1
-_BEYOND = 2.0  # [m] of floor beyond a wall with a door
+# pieces of furniture per square metre of floor at clutter 1
+_DENSITY = 0.45
+# fraction of tables that are against a wall
+_AT_WALL = 0.6
+# [m] of floor beyond a wall with a door
+_BEYOND = 2.0
 _COLOURS = ("teal", "terracotta", "blue", "cream", "orange", "grey", "green")
-_EDGE = 0.1  # [m] from the middle of a free object to the edges of its table
+# [m] from the middle of a free object to the edges of its table
+_EDGE = 0.1
 
 
 @dataclass(frozen=True)
@@ -82,38 +92,19 @@ class RoomSettings:
 
     def __post_init__(self) -> None:
         _check_range("clutter", self.clutter, 0.0, 1.0)
-        for name, low, high in (("height", 2.1, 10.0), ("front", 1.5, 3.0), ("gap", 0.02, 1.0)):
-            _check_range(name, getattr(self, name), low, high)
-        expected = "two lengths of 4 to 20 m, the lower one first"
-        if not isinstance(self.width, tuple | list) or len(self.width) != 2:
-            raise InputError(
-                "not an interval", field="width", expected=expected, got=format_value(self.width)
-            )
-        for value in self.width:
-            _check_range("width", value, 4.0, 20.0)
-        if self.width[0] > self.width[1]:
-            raise InputError(
-                "the interval is empty",
-                field="width",
-                expected=expected,
-                got=format_value(self.width),
-            )
-        object.__setattr__(self, "width", tuple(map(float, self.width)))
+        _check_range("height", self.height, 2.1, 10.0)
+        _check_range("front", self.front, 1.5, 3.0)
+        _check_range("gap", self.gap, 0.02, 1.0)
+        object.__setattr__(self, "width", _parse_width(self.width))
         object.__setattr__(self, "tables", check_integer(self.tables, "tables", low=0, high=10))
         if self.objects is not None:
-            object.__setattr__(
-                self,
-                "objects",
-                tuple(map(_parse_openable, check_list(self.objects, "objects", "a list of types"))),
-            )
+            types: tuple[Any, ...] = check_list(self.objects, "objects", "a list of types")
+            object.__setattr__(self, "objects", tuple(_parse_openable(kind) for kind in types))
         kinds: tuple[Any, ...] = check_list(self.carried, "carried", "a list of types")
-        object.__setattr__(
-            self,
-            "carried",
-            tuple(
-                check_choice(kind, CARRIED, "object that is carried", "carried") for kind in kinds
-            ),
-        )
+        carried = [
+            check_choice(kind, CARRIED, "object that is carried", "carried") for kind in kinds
+        ]
+        object.__setattr__(self, "carried", tuple(carried))
         object.__setattr__(self, "robot", _parse_robot(self.robot))
         if len(self.carried) > _MAX_CARRIED:
             raise InputError(
@@ -131,18 +122,37 @@ class RoomSettings:
             )
 
 
+def _parse_width(width: Any) -> tuple[float, float]:
+    """Return the shortest and longest length of a wall [m]."""
+    expected = "two lengths of 4 to 20 m, the lower one first"
+    if not isinstance(width, tuple | list) or len(width) != 2:
+        raise InputError(
+            "not an interval", field="width", expected=expected, got=format_value(width)
+        )
+    shortest, longest = width
+    _check_range("width", shortest, 4.0, 20.0)
+    _check_range("width", longest, 4.0, 20.0)
+    if shortest > longest:
+        raise InputError(
+            "the interval is empty", field="width", expected=expected, got=format_value(width)
+        )
+    return float(shortest), float(longest)
+
+
+def _is_path(value: Any, endings: tuple[str, ...]) -> bool:
+    """Return whether an object or robot is given by the path of its file."""
+    if isinstance(value, str):
+        return value.endswith(endings) or "/" in value
+    return isinstance(value, Path)
+
+
 def _parse_openable(kind: Any) -> str | dict[str, Any]:
     """Return the type of an object that can be opened. Raises an error for an unknown name."""
     if isinstance(kind, Mapping):
         return check_mapping(kind, "objects")
-    is_path = isinstance(kind, Path) or (
-        isinstance(kind, str) and (kind.endswith((".yaml", ".yml")) or "/" in kind)
-    )
-    return (
-        str(check_path(kind, "objects"))
-        if is_path
-        else check_choice(kind, list_openable_types(), "object that opens", "objects")
-    )
+    if _is_path(kind, (".yaml", ".yml")):
+        return str(check_path(kind, "objects"))
+    return check_choice(kind, list_openable_types(), "object that opens", "objects")
 
 
 def _parse_robot(robot: Any) -> str:
@@ -150,14 +160,9 @@ def _parse_robot(robot: Any) -> str:
 
     Rooms are saved without a folder that paths could be relative to.
     """
-    is_path = isinstance(robot, Path) or (
-        isinstance(robot, str) and (robot.endswith((".urdf", ".yaml", ".yml")) or "/" in robot)
-    )
-    return (
-        str(check_path(robot, "robot").resolve())
-        if is_path
-        else check_text(robot, "robot", "a robot's name, or the path of its file")
-    )
+    if _is_path(robot, (".urdf", ".yaml", ".yml")):
+        return str(check_path(robot, "robot").resolve())
+    return check_text(robot, "robot", "a robot's name, or the path of its file")
 
 
 def _check_range(name: str, value: Any, low: float, high: float) -> None:
@@ -200,20 +205,23 @@ class Layout:
 
     def make_scene(self) -> Scene:
         """Return the room as a scene called `room_<number>`."""
+        # Distances of the sides from the centre; a door leads to floor beyond its wall.
         reach = [self.floor.compute_half_length(side + 1) for side in range(4)]
+        obstacles = parts.make_walls(self.floor, self.settings.height, self.parts)
+        objects: list[dict[str, Any]] = []
         for part in self.parts:
             if part.side is not None:
                 reach[part.side] = self.floor.compute_half_length(part.side + 1) + _BEYOND
+            obstacles += part.obstacles
+            objects += part.objects
+        east, north, west, south = reach
         document = {
             "name": f"room_{self.number}",
             "robot": self.settings.robot,
             "start": {"base": list(self.start)},
-            "arena": {"x": [-reach[2], reach[0]], "y": [-reach[3], reach[1]]},
-            "obstacles": [
-                *parts.make_walls(self.floor, self.settings.height, self.parts),
-                *(entry for part in self.parts for entry in part.obstacles),
-            ],
-            "objects": [entry for part in self.parts for entry in part.objects],
+            "arena": {"x": [-west, east], "y": [-south, north]},
+            "obstacles": obstacles,
+            "objects": objects,
         }
         return Scene.from_document(document, find_resource_folder("scenes"))
 
@@ -246,10 +254,10 @@ def sample_layout(number: int, settings: RoomSettings | None = None, **changes: 
     for name in changes:
         if name not in known:
             raise UnknownNameError("field of RoomSettings", name, known, field=name)
-    chosen = dataclasses.replace(
-        RoomSettings() if settings is None else check_instance(settings, RoomSettings, "settings"),
-        **changes,
-    )
+    if settings is None:
+        settings = RoomSettings()
+    check_instance(settings, RoomSettings, "settings")
+    chosen = dataclasses.replace(settings, **changes)
     rng = np.random.default_rng([1, number])
     radius = _compute_turning_radius(load_robot(chosen.robot))
     named = None if chosen.objects is None else _name_fixtures(chosen.objects, number)
@@ -258,15 +266,12 @@ def sample_layout(number: int, settings: RoomSettings | None = None, **changes: 
         if found is not None:
             floor, standing, start = found
             return Layout(number, chosen, floor, standing, start, radius)
-    expected = (
-        "less clutter, fewer objects or tables, wider rooms, or a robot with a smaller home pose"
-    )
-    got = f"{chosen.clutter:g}, and a robot with a turning radius of {radius:.2f} m"
     raise InputError(
         f"no room in {_MAX_ROOMS} could hold all parts",
         field="clutter",
-        expected=expected,
-        got=got,
+        expected="less clutter, fewer objects or tables, wider rooms, "
+        "or a robot with a smaller home pose",
+        got=f"{chosen.clutter:g}, and a robot with a turning radius of {radius:.2f} m",
     )
 
 
@@ -274,24 +279,31 @@ def _name_fixtures(
     kinds: Sequence[str | Mapping[str, Any]], number: int
 ) -> list[tuple[str, Fixture]]:
     """Return the objects to open, with their names in the room of a number."""
-    names = [make_fixture_name(kind) for kind in kinds]
-    names = [
-        name if names.count(name) == 1 else f"{name}_{names[: k + 1].count(name)}"
-        for k, name in enumerate(names)
-    ]
-    return [
-        (name, make_fixture(kind, 100 * number + k))
-        for k, (name, kind) in enumerate(zip(names, kinds, strict=True))
-    ]
+    names = _number_equal_names([make_fixture_name(kind) for kind in kinds])
+    fixtures = [make_fixture(kind, 100 * number + k) for k, kind in enumerate(kinds)]
+    return list(zip(names, fixtures, strict=True))
+
+
+def _number_equal_names(names: Sequence[str]) -> list[str]:
+    """Return names that differ: "door_1" and "door_2" for two doors."""
+    numbered: list[str] = []
+    for k, name in enumerate(names):
+        if names.count(name) == 1:
+            numbered.append(name)
+        else:
+            numbered.append(f"{name}_{names[: k + 1].count(name)}")
+    return numbered
 
 
 class _Room:
     """A room that is being furnished, by rejection sampling of the places of its parts."""
 
     def __init__(self, settings: RoomSettings, rng: np.random.Generator, radius: float) -> None:
-        self.settings, self.rng, self.radius = settings, rng, radius
-        width, depth = (round(float(size), 2) for size in rng.uniform(*settings.width, 2))
-        self.floor = Floor(width, depth)
+        self.settings = settings
+        self.rng = rng
+        self.radius = radius
+        width, depth = rng.uniform(*settings.width, 2).tolist()
+        self.floor = Floor(round(width, 2), round(depth, 2))
         self.parts: list[Part] = []
         self.start: tuple[float, float, float] | None = None
 
@@ -301,40 +313,47 @@ class _Room:
         """Return floor, parts and start, or None if a part does not fit."""
         if named is None:
             count = int(self.rng.integers(1, 3))
-            named = _name_fixtures(
-                [str(kind) for kind in self.rng.choice(list(OPENABLE), count, replace=False)], 0
-            )
-        fixed = [self._propose_openables(name, own) for name, own in named]
-        fixed += [self._propose_tables(f"table_{k + 1}") for k in range(self.settings.tables)]
-        if not all(self._add_first_fitting(proposals) for proposals in fixed):
-            return None
+            kinds = self.rng.choice(list(OPENABLE), count, replace=False)
+            named = _name_fixtures([str(kind) for kind in kinds], 0)
+        for name, own in named:
+            if not self._add_first_fitting(self._propose_openables(name, own)):
+                return None
+        for k in range(self.settings.tables):
+            if not self._add_first_fitting(self._propose_tables(f"table_{k + 1}")):
+                return None
         start = self._sample_start()
         if start is None:
             return None
         self.start = start
-        free = self.floor.width * self.floor.depth - sum(
-            part.footprint.length * part.footprint.width for part in self.parts
-        )
-        furniture = (
+        if not self._add_clutter():
+            return None
+        carried: list[Part] = []
+        for k, kind in enumerate(self.settings.carried):
+            (table,) = (part for part in self.parts if part.name == "table_1")
+            carried.append(self._place_carried_object(kind, k, table))
+        return self.floor, (*self.parts, *carried), start
+
+    def _add_clutter(self) -> bool:
+        """Add random furniture; return whether all of it fits."""
+        proposals = (
             ("box", self._propose_boxes),
             ("box", self._propose_boxes),
             ("shelf", self._propose_shelves),
             ("table", self._propose_tables),
         )
-        for k in range(round(self.settings.clutter * _DENSITY * free)):
-            kind, propose = furniture[int(self.rng.integers(4))]
-            if not self._add_first_fitting(propose(f"{kind}_{k + 1 + self.settings.tables}")):
-                return None
-        tables = [part for part in self.parts if part.name == "table_1"]
-        standing = [
-            self._place_carried_object(kind, k, tables[0])
-            for k, kind in enumerate(self.settings.carried)
-        ]
-        return self.floor, (*self.parts, *standing), start
+        occupied = sum(part.footprint.length * part.footprint.width for part in self.parts)
+        free = self.floor.width * self.floor.depth - occupied
+        count = round(self.settings.clutter * _DENSITY * free)
+        for k in range(count):
+            kind, propose = proposals[int(self.rng.integers(4))]
+            number = k + 1 + self.settings.tables
+            if not self._add_first_fitting(propose(f"{kind}_{number}")):
+                return False
+        return True
 
     def _add_first_fitting(self, proposals: Iterator[Part]) -> bool:
         """Add the first of some proposed parts that fits; return whether one does."""
-        for _, part in zip(range(_MAX_TRIES), proposals, strict=False):
+        for part in itertools.islice(proposals, _MAX_TRIES):
             if self._does_fit(part):
                 self.parts.append(part)
                 return True
@@ -342,48 +361,47 @@ class _Room:
 
     def _does_fit(self, part: Part) -> bool:
         """Return whether a part is clear of the others, and keeps the required floor free."""
-        own, gap = part.footprint, self.settings.gap
-        if (part.side is None and not self.floor.contains(own)) or (
-            part.clear_floor and not self.floor.contains(part.clear_floor)
-        ):
+        own = part.footprint
+        if part.side is None and not self.floor.contains(own):
             return False
-        for other in self.parts:
-            pairs = [
-                (own, other.footprint),
-                (own, other.clear_floor),
-                (part.clear_floor, other.footprint),
-            ]
-            if any(
-                one is not None and two is not None and one.compute_gap(two) < gap
-                for one, two in pairs
-            ):
-                return False
+        if part.clear_floor and not self.floor.contains(part.clear_floor):
+            return False
+        if any(self._are_close(part, other) for other in self.parts):
+            return False
+        footprints = [one.footprint for one in (*self.parts, part)]
         places = [
             one.standing_place for one in (*self.parts, part) if one.standing_place is not None
         ]
         if self.start is not None:
-            places.append(self.start[:2])
-        standing = [one.footprint for one in (*self.parts, part)]
-        if (
-            self.start is not None
-            and not self.floor.find_free([own], self.radius, [self.start[:2]])[0]
-        ):
-            return False
-        return self.floor.is_connected(standing, self.radius, places)
+            position = self.start[:2]
+            if not self.floor.find_free([own], self.radius, [position])[0]:
+                return False
+            places.append(position)
+        return self.floor.is_connected(footprints, self.radius, places)
+
+    def _are_close(self, part: Part, other: Part) -> bool:
+        """Return whether a part is too close to another one, or to the floor before it."""
+        pairs = [
+            (part.footprint, other.footprint),
+            (part.footprint, other.clear_floor),
+            (other.footprint, part.clear_floor),
+        ]
+        for footprint, floor in pairs:
+            if floor is not None and footprint.compute_gap(floor) < self.settings.gap:
+                return True
+        return False
 
     def _sample_start(self) -> tuple[float, float, float] | None:
         """Return a start from which the robot reaches all places to stand, or None."""
-        standing = [part.footprint for part in self.parts]
+        footprints = [part.footprint for part in self.parts]
         places = [part.standing_place for part in self.parts if part.standing_place is not None]
         half = np.array([self.floor.width, self.floor.depth]) / 2.0
         for _ in range(_MAX_STARTS):
-            x, y, yaw = (
-                round(float(value), 3)
-                for value in self.rng.uniform([*-half, -math.pi], [*half, math.pi])
-            )
-            if self.floor.find_free(standing, self.radius, [[x, y]])[0] and self.floor.is_connected(
-                standing, self.radius, [*places, (x, y)]
-            ):
+            pose = self.rng.uniform([*-half, -math.pi], [*half, math.pi])
+            x, y, yaw = (round(float(value), 3) for value in pose)
+            if not self.floor.find_free(footprints, self.radius, [[x, y]])[0]:
+                continue
+            if self.floor.is_connected(footprints, self.radius, [*places, (x, y)]):
                 return x, y, yaw
         return None
 
@@ -394,6 +412,7 @@ class _Room:
         return side, round(float(self.rng.uniform(-reach, reach)), 3)
 
     def _sample_frame(self, yaw: float) -> Frame:
+        """Return a frame anywhere on the floor."""
         half = np.array([self.floor.width, self.floor.depth]) / 2.0
         x, y = (round(float(value), 3) for value in self.rng.uniform(-half, half))
         return Frame(x, y, yaw)
@@ -412,20 +431,19 @@ class _Room:
             depth, width, height = self._sample_size((0.6, 0.9), (0.8, 1.6), (0.70, 0.78))
             side, along = self._sample_wall_position(width)
             wall = self.floor.make_wall_frame(side, along)
-            frame = Frame(*wall.transform_point(-depth / 2.0 - parts.AIR, 0.0), wall.yaw)
-            frame = frame if self.rng.random() < 0.6 else self._sample_frame(wall.yaw)
+            if self.rng.random() < _AT_WALL:
+                frame = Frame(*wall.transform_point(-depth / 2.0 - parts.AIR, 0.0), wall.yaw)
+            else:
+                frame = self._sample_frame(wall.yaw)
             yield parts.make_table(name, frame, (depth, width, height))
 
     def _propose_shelves(self, name: str) -> Iterator[Part]:
         while True:
             depth, width, height = self._sample_size((0.28, 0.4), (0.6, 1.2), (1.2, 2.0))
             boards = int(self.rng.integers(4, 6))
-            yield parts.make_shelf(
-                name,
-                self.floor.make_wall_frame(*self._sample_wall_position(width)),
-                (depth, width, height),
-                boards,
-            )
+            side, along = self._sample_wall_position(width)
+            frame = self.floor.make_wall_frame(side, along)
+            yield parts.make_shelf(name, frame, (depth, width, height), boards)
 
     def _propose_boxes(self, name: str) -> Iterator[Part]:
         colour = _COLOURS[int(self.rng.integers(len(_COLOURS)))]
@@ -441,23 +459,19 @@ class _Room:
         slot = (width - 2.0 * _EDGE) / count  # each object has its own part of the edge
         y = -width / 2.0 + _EDGE + slot * (number + float(self.rng.uniform(0.25, 0.75)))
         x = -depth / 2.0 + float(self.rng.uniform(_EDGE, 0.3))
-        kinds = self.settings.carried
-        name = kind if kinds.count(kind) == 1 else f"{kind}_{kinds[: number + 1].count(kind)}"
+        name = _number_equal_names(self.settings.carried)[number]
         return parts.make_carried_object(name, kind, on, x, y)
 
 
 def _compute_turning_radius(robot: Robot) -> float:
     """Return the radius of a disc in which a robot with its arm at home turns freely [m]."""
-    data, shapes = robot.model.createData(), robot.collision.createData()
-    rest = np.concatenate([np.zeros(3), robot.home])
-    pin.updateGeometryPlacements(
-        robot.model, data, robot.collision, shapes, robot.coordinates.q(rest)
-    )
-    boxes = [
-        compute_world_box(shape.geometry, where)
-        for shape, where in zip(robot.collision.geometryObjects, shapes.oMg, strict=True)
-    ]
-    reach = max(
-        float(np.hypot(*np.maximum(np.abs(low[:2]), np.abs(high[:2])))) for low, high in boxes
-    )
+    data = robot.model.createData()
+    shapes = robot.collision.createData()
+    q = robot.coordinates.q(np.concatenate([np.zeros(3), robot.home]))
+    pin.updateGeometryPlacements(robot.model, data, robot.collision, shapes, q)
+    reach = 0.0
+    for shape, placement in zip(robot.collision.geometryObjects, shapes.oMg, strict=True):
+        low, high = compute_world_box(shape.geometry, placement)
+        farthest = np.maximum(np.abs(low[:2]), np.abs(high[:2]))
+        reach = max(reach, float(np.hypot(*farthest)))
     return reach + max(_TURNING, START_CLEARANCE)

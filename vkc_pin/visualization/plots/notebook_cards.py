@@ -18,21 +18,29 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
-_SIDE = 4.4  # [inch], longer side of the picture
+# [inch], longer side of the picture
+_SIDE = 4.4
 _DPI = 72
-_COLOURS = 96  # of its palette
-_LISTED = 6  # violations and notes shown; the report has all of them
-_GOOD, _BAD = "#1a7f37", "#c62828"
+# colours of its palette
+_COLOURS = 96
+# violations and notes shown; the report has all of them
+_LISTED = 6
+# colours of texts
+_GOOD = "#1a7f37"
+_BAD = "#c62828"
 
 
 @make_card.register(Scene)
 def scene_html(scene: Scene) -> str:
     """Render a scene as HTML, with an overview and a top view."""
-    objects = []
+    objects: list[str] = []
     for name, placed in scene.objects.items():
-        joints = ", ".join(placed.object.coordinates.names)
-        kind = "can be carried" if placed.object.free else joints
-        objects.append(f"{name} ({kind or 'no joints'}{', held' if name in scene.held else ''})")
+        if placed.object.free:
+            kind = "can be carried"
+        else:
+            kind = ", ".join(placed.object.coordinates.names) or "no joints"
+        held = ", held" if name in scene.held else ""
+        objects.append(f"{name} ({kind}{held})")
     x_min, x_max, y_min, y_max = scene.arena
     x, y, yaw = scene.start[:3].tolist()
     rows = [
@@ -42,47 +50,51 @@ def scene_html(scene: Scene) -> str:
         ("objects", escape(", ".join(objects) or "none")),
         ("obstacles", str(len(scene.obstacle_names))),
     ]
-    return _arrange(
-        f"<b>{escape(scene.name)}</b>{_render_table(rows)}",
-        _render_picture(scene, None, "the scene from above"),
-    )
+    text = f"<b>{escape(scene.name)}</b>{_render_table(rows)}"
+    return _arrange(text, _render_picture(scene, None, "the scene from above"))
 
 
 def motion_html(plan: CheckedMotion) -> str:
     """Render a plan as self-contained HTML, with its result and a top view of the motion."""
-    m = plan.metrics
-    good = plan.success
-    status = "success" if good else f"FAILED, {plan.status}"
-    mark = f'<span style="color: {_GOOD if good else _BAD}">{escape(status)}</span>'
+    metrics = plan.metrics
+    if plan.success:
+        mark = f'<span style="color: {_GOOD}">success</span>'
+    else:
+        mark = f'<span style="color: {_BAD}">{escape(f"FAILED, {plan.status}")}</span>'
     head = f"<b>{escape(plan.scene.name)}: {mark}</b>"
     phases = escape(", ".join(phase.name for phase in plan.trajectory.phases))
     rows = [
-        ("base", _format_metric(m, "base_path_length", "m", 2)),
-        ("arm", _format_metric(m, "arm_path_length", "rad", 2)),
-        ("clearance", _format_metric(m, "clearance", "mm", 1, 1e3)),
-        ("duration", _format_metric(m, "duration", "s", 1)),
-        ("planned in", _format_metric(m, "planning_time", "s", 2)),
+        ("base", _format_metric(metrics, "base_path_length", "m", 2)),
+        ("arm", _format_metric(metrics, "arm_path_length", "rad", 2)),
+        ("clearance", _format_metric(metrics, "clearance", "mm", 1, 1e3)),
+        ("duration", _format_metric(metrics, "duration", "s", 1)),
+        ("planned in", _format_metric(metrics, "planning_time", "s", 2)),
         ("seed", escape(f"{plan.initialization or 'unknown'}, random numbers {plan.seed}")),
     ]
-    found = [str(violation) for violation in plan.report.violations] + list(plan.report.notes)
-    lines = [
-        *found[:_LISTED],
-        *([f"... and {len(found) - _LISTED} more"] if len(found) > _LISTED else []),
-    ]
-    listed = "".join(f"<li>{escape(line)}</li>" for line in lines)
-    problems = f'<ul style="color: {_BAD}; margin: 4px 0">{listed}</ul>' if lines else ""
+    problems = _render_problems(plan)
     view = _render_picture(plan.scene, plan.trajectory, "the motion from above")
     return _arrange(f"{head}<div>{phases}</div>{_render_table(rows)}{problems}", view)
+
+
+def _render_problems(plan: CheckedMotion) -> str:
+    """Render a list of the first violations and notes; "" without any."""
+    found = [str(violation) for violation in plan.report.violations] + list(plan.report.notes)
+    if not found:
+        return ""
+    lines = found[:_LISTED]
+    if len(found) > _LISTED:
+        lines.append(f"... and {len(found) - _LISTED} more")
+    listed = "".join(f"<li>{escape(line)}</li>" for line in lines)
+    return f'<ul style="color: {_BAD}; margin: 4px 0">{listed}</ul>'
 
 
 def _render_table(rows: list[tuple[str, str]]) -> str:
     """Render a table whose values are HTML."""
     cell = "text-align: left; padding: 1px 10px 1px 0; background: none"
-    body = "".join(
-        f'<tr><td style="{cell}; white-space: nowrap">{escape(name)}</td>'
-        f'<td style="{cell}">{value}</td></tr>'
-        for name, value in rows
-    )
+    body = ""
+    for name, value in rows:
+        body += f'<tr><td style="{cell}; white-space: nowrap">{escape(name)}</td>'
+        body += f'<td style="{cell}">{value}</td></tr>'
     return f'<table style="border: none; margin: 6px 0">{body}</table>'
 
 
@@ -100,14 +112,11 @@ def _render_picture(scene: Scene, trajectory: Trajectory | None, title: str) -> 
     from PIL import Image
 
     x_min, x_max, y_min, y_max = scene.arena
-    wide, high = x_max - x_min, y_max - y_min
-    scale = _SIDE / max(wide, high)
+    scale = _SIDE / max(x_max - x_min, y_max - y_min)
+    width = max(2.6, scale * (x_max - x_min)) + 0.4
+    height = max(1.8, scale * (y_max - y_min)) + 0.6
     with matplotlib.rc_context(STYLE):
-        figure = Figure(
-            figsize=(max(2.6, scale * wide) + 0.4, max(1.8, scale * high) + 0.6),
-            dpi=_DPI,
-            layout="constrained",
-        )
+        figure = Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
         canvas = cast(Any, FigureCanvasAgg(figure))  # its methods have no types
         draw_top_view(figure, World(scene), trajectory, columns=2)
         canvas.draw()
@@ -121,7 +130,8 @@ def _render_picture(scene: Scene, trajectory: Trajectory | None, title: str) -> 
 def _format_metric(
     metrics: Mapping[str, float], name: str, unit: str, digits: int, factor: float = 1.0
 ) -> str:
+    """Format a metric in a unit; a dash if it is unknown."""
     value = metrics.get(name)
-    return (
-        f"{factor * value:.{digits}f} {unit}" if value is not None and np.isfinite(value) else "–"
-    )
+    if value is None or not np.isfinite(value):
+        return "–"
+    return f"{factor * value:.{digits}f} {unit}"

@@ -5,7 +5,7 @@ Figures are made without pyplot: they need no screen, and none stays open.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -49,12 +49,14 @@ _KINDS = (
 )
 SAMPLES = 240
 """Number of times at which a motion is drawn, besides its waypoints and knots."""
-_BEFORE = 1e-9  # offset before a knot, where accelerations jump [s]
+# [s] offset before a knot, where accelerations jump
+_BEFORE = 1e-9
 DASHES: Any = {"linestyle": (0, (5, 3)), "linewidth": 0.9}
 """Style of limits."""
 PICTURES = (".png", ".svg", ".pdf")
 """File name extensions of pictures."""
-_SHOWN = 0.30  # larger clearances are cut off [m]
+# [m] larger clearances are cut off
+_SHOWN = 0.30
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,48 +90,63 @@ def compute_clearance_curves(
     surroundings, and gripper and grasped objects, which may touch.
     """
     world = World(scene)
-    solids = CollisionShapes(world)
-    table = PairTable(scene, solids, trajectory, 0.0)
-    silent = {
-        pair
-        for one in find_clearance_exemptions(scene, Options().dist_safe)
-        for pair in one.find_shape_pairs(world.collision_labels, world.collision_keys)
-        if one.margin == -np.inf
-    }
-    moments = np.atleast_1d(np.asarray(times, float))
-    holds = {hold for phase in trajectory.phases for hold in phase.holds} | set(scene.holds)
-    gripped = {
-        (link, find_grasped_link(scene, hold))
-        for hold in holds
-        for link in find_touch_links(scene, hold)
-    }
+    labels = world.collision_labels
+    table = PairTable(scene, CollisionShapes(world), trajectory, 0.0)
+    unchecked = _find_unchecked_pairs(world)
+    gripped = _find_gripped_links(scene, trajectory)
     kinds = np.array([_find_kind(table, pair, gripped) for pair in table.pairs])
-    asked = np.array([(min(pair), max(pair)) not in silent for pair in table.pairs.tolist()], bool)
-    groups = {
-        kind: table.pairs[(kinds == kind) & asked]
-        for kind in _KINDS
-        if ((kinds == kind) & asked).any()
-    }
-    placed = table.solids.place(world.coordinates.q(world.compute_positions(trajectory, moments)))
-    curves = []
-    for kind, pairs in groups.items():
-        which, distances = placed.find_nearest(pairs)
-        names = tuple(
-            (world.collision_labels[i], world.collision_labels[j]) for i, j in pairs[which]
-        )
-        curves.append(ClearanceCurve(kind, moments, distances, names))
+    is_checked = np.array(
+        [(min(pair), max(pair)) not in unchecked for pair in table.pairs.tolist()], bool
+    )
+    moments = np.atleast_1d(np.asarray(times, float))
+    z = world.compute_positions(trajectory, moments)
+    placed = table.solids.place(world.coordinates.q(z))
+    curves: list[ClearanceCurve] = []
+    for kind in _KINDS:
+        pairs = table.pairs[(kinds == kind) & is_checked]
+        if not len(pairs):
+            continue
+        nearest, distances = placed.find_nearest(pairs)
+        names = [(labels[i], labels[j]) for i, j in pairs[nearest]]
+        curves.append(ClearanceCurve(kind, moments, distances, tuple(names)))
     return curves
 
 
+def _find_unchecked_pairs(world: World) -> set[tuple[int, int]]:
+    """Return the pairs of shapes whose distance the scene does not limit, the smaller first."""
+    pairs = set[tuple[int, int]]()
+    for exemption in find_clearance_exemptions(world.scene, Options().dist_safe):
+        if exemption.margin == -np.inf:
+            pairs.update(exemption.find_shape_pairs(world.collision_labels, world.collision_keys))
+    return pairs
+
+
+def _find_gripped_links(scene: Scene, trajectory: Trajectory) -> set[tuple[str, str]]:
+    """Return the pairs of a holder's link and the link that it grasps, at any time."""
+    holds = set(scene.holds)
+    for phase in trajectory.phases:
+        holds.update(phase.holds)
+    gripped = set[tuple[str, str]]()
+    for hold in holds:
+        grasped = find_grasped_link(scene, hold)
+        gripped.update((link, grasped) for link in find_touch_links(scene, hold))
+    return gripped
+
+
 def _find_kind(table: PairTable, pair: Ints, gripped: Set[tuple[str, str]]) -> str:
-    first, second = (table.groups[int(i)] for i in pair)
-    one, other = (table.world.collision_labels[int(i)] for i in pair)
-    if first == "robot" and (one, other) in gripped:
+    """Return the kind of a pair of shapes."""
+    i, j = pair.tolist()
+    first = table.groups[i]
+    second = table.groups[j]
+    labels = table.world.collision_labels
+    if first == "robot" and (labels[i], labels[j]) in gripped:
         return _KINDS[4]
     if first != "robot" and second != "robot":
         return _KINDS[3]
-    owner = second if first == "robot" else first
-    return {"robot": _KINDS[0], "": _KINDS[2]}.get(owner, _KINDS[1])
+    other = second if first == "robot" else first
+    if other == "robot":
+        return _KINDS[0]
+    return _KINDS[1] if other else _KINDS[2]
 
 
 @dataclass(frozen=True)
@@ -156,9 +173,10 @@ def _find_limit(kind: str) -> Callable[[CheckedMotion, str], float]:
     """Return a function that finds a limit, "velocity" or "acceleration"; grasps have none."""
 
     def limit(plan: CheckedMotion, name: str) -> float:
-        robot, (owner, _, joint) = plan.scene.robot, name.partition(".")
+        robot = plan.scene.robot
         if name in robot.coordinates.names:
             return float(getattr(robot, kind)[robot.coordinates.names.index(name)])
+        owner, _, joint = name.partition(".")
         placed = plan.scene.objects.get(owner)
         if placed is None or joint not in placed.object.coordinates.names:
             return float("inf")
@@ -168,12 +186,11 @@ def _find_limit(kind: str) -> Callable[[CheckedMotion, str], float]:
 
 
 def _sample_accelerations(plan: CheckedMotion, times: Floats) -> tuple[Floats, Floats]:
+    """Return times and accelerations; without a curve those at waypoints."""
     motion = plan.trajectory
-    return (
-        (times, motion.acceleration(times))
-        if motion.curve is not None
-        else (motion.times, motion.accelerations())
-    )
+    if motion.curve is None:
+        return motion.times, motion.accelerations()
+    return times, motion.acceleration(times)
 
 
 _QUANTITIES: tuple[_Quantity, ...] = (
@@ -207,10 +224,11 @@ def _make_jerk() -> _Quantity:
     def values(plan: CheckedMotion, times: Floats) -> tuple[Floats, Floats]:
         curve = plan.trajectory.curve
         assert curve is not None
-        edges = curve.acceleration(
-            curve.times[:-1] + 0.5 * np.diff(curve.times)
-        ) - curve.acceleration(curve.times[:-1])
-        jerks = 2.0 * edges / np.diff(curve.times)[:, None]
+        begins = curve.times[:-1]
+        spans = np.diff(curve.times)
+        # Accelerations are linear on each cubic, and may jump at its ends.
+        changes = curve.acceleration(begins + 0.5 * spans) - curve.acceleration(begins)
+        jerks = 2.0 * changes / spans[:, None]
         return curve.times, np.concatenate([jerks, jerks[-1:]])
 
     def limit(plan: CheckedMotion, name: str) -> float:
@@ -227,54 +245,61 @@ def _make_jerk() -> _Quantity:
 
 def find_groups(trajectory: Trajectory) -> dict[str, list[int]]:
     """Return the columns of a trajectory that belong to base, arm and objects."""
-    names, robot = trajectory.names, trajectory.robot_size
+    size = trajectory.robot_size
     groups = {
         "base": list(range(3)),
-        "arm": list(range(3, robot)),
-        "object": list(range(robot, len(names))),
+        "arm": list(range(3, size)),
+        "object": list(range(size, len(trajectory.names))),
     }
     return {name: columns for name, columns in groups.items() if columns}
 
 
 def draw_joints(figure: FigureBase, plan: CheckedMotion) -> None:
     """Draw all quantities, with one row each for base, arm and objects."""
-    groups, motion = find_groups(plan.trajectory), plan.trajectory
-    eased = motion.curve is not None and plan.options.jerk_time > 0.0
-    drawn = (*_QUANTITIES, _make_jerk()) if eased else _QUANTITIES
-    axes: Any = figure.subplots(len(groups), len(drawn), sharex=True, squeeze=False)
+    motion = plan.trajectory
+    groups = find_groups(motion)
+    has_jerk_limits = motion.curve is not None and plan.options.jerk_time > 0.0
+    quantities = (*_QUANTITIES, _make_jerk()) if has_jerk_limits else _QUANTITIES
+    grid: Any = figure.subplots(len(groups), len(quantities), sharex=True, squeeze=False)
     parts = [np.linspace(motion.times[0], motion.times[-1], SAMPLES), motion.times]
     if motion.curve is not None:
         parts += [motion.curve.times, motion.curve.times[1:] - _BEFORE]
-    fine = np.unique(np.concatenate(parts))
-    for quantity, column in zip(drawn, axes.T, strict=True):
-        moments, values = quantity.values(plan, fine)
-        for place, (group, own) in zip(column, groups.items(), strict=True):
-            _draw(place, plan, quantity, group, own, moments, values)
-    for row in axes:
-        handles = row[0].get_legend_handles_labels()[0]
-        limited = [
+    times = np.unique(np.concatenate(parts))
+    for quantity, column in zip(quantities, grid.T, strict=True):
+        moments, values = quantity.values(plan, times)
+        for axes, (group, own) in zip(column, groups.items(), strict=True):
+            _draw(axes, plan, quantity, group, own, moments, values)
+    for row in grid:
+        _add_legend(row)
+    for axes in grid.ravel():
+        shade_phases(axes, motion)
+        axes.margins(x=0.0)
+    for axes in grid[0]:
+        name_phases(axes, plan)
+    for axes in grid[-1]:
+        axes.set_xlabel("time [s]")
+
+
+def _add_legend(row: Sequence[Axes]) -> None:
+    """Add a legend beside a row of axes: the lines of the first ones, and one limit."""
+    handles, _ = row[0].get_legend_handles_labels()
+    limits: list[Any] = []
+    for axes in row:
+        limits += [
             handle
-            for place in row
-            for handle in place.get_legend_handles_labels()[0]
+            for handle in axes.get_legend_handles_labels()[0]
             if handle.get_label() == "limit"
         ]
-        row[-1].legend(
-            handles=[*handles, *limited[:1]],
-            loc="center left",
-            bbox_to_anchor=(1.0, 0.5),
-            fontsize=7.5,
-        )
-    for place in axes.ravel():
-        shade_phases(place, motion)
-        place.margins(x=0.0)
-    for place in axes[0]:
-        name_phases(place, plan)
-    for place in axes[-1]:
-        place.set_xlabel("time [s]")
+    row[-1].legend(
+        handles=[*handles, *limits[:1]],
+        loc="center left",
+        bbox_to_anchor=(1.0, 0.5),
+        fontsize=7.5,
+    )
 
 
 def _draw(
-    place: Axes,
+    axes: Axes,
     plan: CheckedMotion,
     quantity: _Quantity,
     group: str,
@@ -284,24 +309,27 @@ def _draw(
 ) -> None:
     """Draw a quantity of a group of coordinates, with its limits."""
     names = plan.trajectory.names
-    place.set_visible(bool(np.isfinite(values[:, columns]).any()))
+    axes.set_visible(bool(np.isfinite(values[:, columns]).any()))
     for k, column in enumerate(columns):
         style = {
             "color": COLOURS[k % len(COLOURS)],
             "linewidth": 1.3,
             **quantity.style(plan.trajectory),
         }
-        place.plot(moments, values[:, column], label=names[column].removesuffix("_joint"), **style)
+        label = names[column].removesuffix("_joint")
+        axes.plot(moments, values[:, column], label=label, **style)
     limits = [quantity.limit(plan, names[column]) for column in columns]
-    for limit in sorted(set(filter(np.isfinite, limits))):
+    finite = {limit for limit in limits if np.isfinite(limit)}
+    for limit in sorted(finite):
         same = [k for k, other in enumerate(limits) if other == limit]
         colour = COLOURS[same[0] % len(COLOURS)] if len(same) == 1 else "0.35"
-        for sign in (-1.0, 1.0):
-            place.axhline(sign * limit, color=colour, **DASHES)
-    if any(map(np.isfinite, limits)):
-        place.plot([], [], color="0.35", label="limit", **DASHES)
+        axes.axhline(-limit, color=colour, **DASHES)
+        axes.axhline(limit, color=colour, **DASHES)
+    if finite:
+        axes.plot([], [], color="0.35", label="limit", **DASHES)
     own = {"base": ("m", "rad"), "arm": ("rad",), "object": ("rad", "m")}[group]
-    place.set_ylabel(f"{group} {quantity.name} [{', '.join(quantity.units[unit] for unit in own)}]")
+    units = ", ".join(quantity.units[unit] for unit in own)
+    axes.set_ylabel(f"{group} {quantity.name} [{units}]")
 
 
 def name_phases(axes: Axes, plan: CheckedMotion) -> None:
@@ -377,10 +405,10 @@ def plot_top_view(plan: CheckedMotion) -> Figure:
     """Plot the top view: obstacles, objects, the base at several times, paths of base and tool."""
     _check_plan(plan)
     x_min, x_max, y_min, y_max = plan.scene.arena
+    width = 9.0
+    height = float(np.clip(width * (y_max - y_min) / (x_max - x_min) + 0.7, 4.0, 10.0))
     with use_style():
-        figure = new_figure(
-            9.0, float(np.clip(9.0 * (y_max - y_min) / (x_max - x_min) + 0.7, 4.0, 10.0))
-        )
+        figure = new_figure(width, height)
         draw_top_view(figure, World(plan.scene), plan.trajectory)
     return figure
 
@@ -393,6 +421,8 @@ def _check_plan(plan: CheckedMotion) -> None:
 
 
 def _plot_all(plan: CheckedMotion) -> Figure:
+    """Plot everything in one figure."""
+    outcome = "success" if plan.success else f"FAILED, {plan.status}"
     with use_style():
         figure = new_figure(16.0, 11.0)
         parts: Any = figure.subfigures(2, 1, height_ratios=(1.15, 1.0))
@@ -401,20 +431,16 @@ def _plot_all(plan: CheckedMotion) -> Figure:
         left, right = lower.subfigures(1, 2, width_ratios=(1.0, 1.25))
         _draw_clearance(left, plan)
         draw_top_view(right, World(plan.scene), plan.trajectory)
-        figure.suptitle(
-            f"{plan.scene.name}: {'success' if plan.success else 'FAILED, ' + plan.status}",
-            fontweight="bold",
-        )
+        figure.suptitle(f"{plan.scene.name}: {outcome}", fontweight="bold")
     return figure
 
 
 def _draw_clearance(figure: FigureBase, plan: CheckedMotion) -> None:
-    axes, trajectory = figure.subplots(), plan.trajectory
-    times = np.unique(
-        np.concatenate(
-            [np.linspace(trajectory.times[0], trajectory.times[-1], SAMPLES), trajectory.times]
-        )
-    )
+    """Draw the smallest distances over time; the legend names the closest pairs."""
+    axes = figure.subplots()
+    trajectory = plan.trajectory
+    even = np.linspace(trajectory.times[0], trajectory.times[-1], SAMPLES)
+    times = np.unique(np.concatenate([even, trajectory.times]))
     safe = plan.options.dist_safe
     lowest = 0.0
     for k, curve in enumerate(compute_clearance_curves(plan.scene, trajectory, times)):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -23,15 +24,25 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.world_model import World
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
-_ARROW = 0.35  # [m]
-_MARGIN, _BEYOND = 0.3, 0.1  # [m] around the content, and around labels
-_LARGE, _SMALL = 7.0, 2.5  # [inch] longer side of the plan, and smallest length of the other
-_FRAME, _LEGEND = 0.8, 2.6  # [inch] for labels of the axes, and for the legend
-_LETTERS = 40  # in a line of the legend
-_BESIDE = 0.4  # largest distance between arrows that share a label [m]
+# [m] length of arrows
+_ARROW = 0.35
+# [m] around the content, and around labels
+_MARGIN = 0.3
+_LABEL_MARGIN = 0.1
+# [inch] longer side of the plan, and smallest length of the other
+_LARGE = 7.0
+_SMALL = 2.5
+# [inch] for labels of the axes, and for the legend
+_FRAME = 0.8
+_LEGEND = 2.6
+# in a line of the legend
+_LETTERS = 40
+# [m] largest distance between arrows that share a label
+_BESIDE = 0.4
 
 
 class Approach(NamedTuple):
@@ -67,9 +78,6 @@ def plot_scene(
     Raises:
         InputError: `path` has another extension.
     """
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Polygon
-
     target = None if path is None else check_path(path, "path")
     if target is not None and target.suffix.lower() not in PICTURES:
         raise InputError(
@@ -78,68 +86,126 @@ def plot_scene(
             expected=f"one that ends with {', '.join(PICTURES)}",
             got=path,
         )
-    world, (blue, red) = World(scene), COLOURS[:2]
+    world = World(scene)
     with use_style():
         figure = new_figure(_LARGE, _LARGE)
         draw_top_view(figure, world, None)
         axes = figure.axes[0]
-        data = world.model.createData()
-        pin.forwardKinematics(world.model, data, world.coordinates.q(world.start))
-        for label, shape in zip(world.collision_labels, world.shapes, strict=True):
-            if label in stuck and label != FLOOR:
-                where = data.oMi[shape.parentJoint] * shape.placement
-                corners = triangulate(shape.geometry)[0] @ where.rotation.T + where.translation
-                axes.add_patch(
-                    Polygon(
-                        compute_outline(corners), fill=False, edgecolor=red, linewidth=2.0, zorder=6
-                    )
-                )
-        names: list[tuple[str, tuple[float, float], tuple[str, str]]] = []
-        for name, at, direction, base in approaches:
-            (x, y), (u, v) = at[:2].tolist(), (at[:2] - _ARROW * direction[:2]).tolist()
-            colour = red if base is None else blue
-            arrow = {"arrowstyle": "->", "color": colour, "linewidth": 1.8}
-            axes.annotate("", (x, y), (u, v), arrowprops=arrow, zorder=7)
-            owner, _, own = name.partition(".")
-            beside = (
-                k
-                for k, (_, place, one) in enumerate(names)
-                if one == (owner, colour) and math.dist(place, (u, v)) < _BESIDE
+        _outline_links(axes, world, stuck)
+        labels: list[_Label] = []
+        for approach in approaches:
+            _draw_approach(axes, approach)
+            _add_label(labels, approach)
+        for number, label in enumerate(labels, 1):
+            axes.annotate(
+                str(number), label.at, color=label.colour, fontsize=8, weight="bold", zorder=8
             )
-            k = next(beside, None)
-            if k is None:
-                names.append((name, (u, v), (owner, colour)))
-            else:
-                names[k] = (f"{names[k][0]}, {own}", *names[k][1:])
-            if base is not None:
-                axes.plot([base[0], x], [base[1], y], ":", color=colour, linewidth=0.8, zorder=5)
-                axes.plot(base[0], base[1], "o", color=colour, markersize=4, zorder=7)
-        for number, (_, place, (_, colour)) in enumerate(names, 1):
-            axes.annotate(str(number), place, color=colour, fontsize=8, weight="bold", zorder=8)
-        _fit(figure, [place for _, place, _ in names], bool(names))
-        if names:
-            handles = [
-                Line2D([], [], linestyle="", marker=f"${k}$", color=colour, label=_wrap(text))
-                for k, (text, _, (_, colour)) in enumerate(names, 1)
-            ]
-            figure.legend(handles=handles, loc="outside right upper", fontsize=7)
+        _fit(figure, [label.at for label in labels])
+        if labels:
+            _add_legend(figure, labels)
         return save_figure(figure, target)
 
 
-def _fit(figure: Figure, places: Sequence[tuple[float, float]], has_legend: bool) -> None:
-    """Set the limits to the content within the arena, and the figure's size to their ratio."""
+@dataclass
+class _Label:
+    """A numbered label at arrows that share it.
+
+    Attributes:
+        text: Names of the attachments.
+        owner: Their object.
+        at: Position, x and y [m].
+        colour: Colour of the arrows.
+    """
+
+    text: str
+    owner: str
+    at: tuple[float, float]
+    colour: str
+
+
+def _choose_colour(approach: Approach) -> str:
+    """Return the colour of an approach: blue if it is reachable, else red."""
+    blue, red = COLOURS[:2]
+    return red if approach.base is None else blue
+
+
+def _find_tail(approach: Approach) -> tuple[float, float]:
+    """Return where the arrow of an approach begins, x and y [m]."""
+    x, y = (approach.at[:2] - _ARROW * approach.direction[:2]).tolist()
+    return x, y
+
+
+def _outline_links(axes: Axes, world: World, labels: Sequence[str]) -> None:
+    """Outline links and obstacles in red."""
+    from matplotlib.patches import Polygon
+
+    red = COLOURS[1]
+    data = world.model.createData()
+    pin.forwardKinematics(world.model, data, world.coordinates.q(world.start))
+    for label, shape in zip(world.collision_labels, world.shapes, strict=True):
+        if label not in labels or label == FLOOR:
+            continue
+        placement = data.oMi[shape.parentJoint] * shape.placement
+        vertices, _ = triangulate(shape.geometry)
+        corners = vertices @ placement.rotation.T + placement.translation
+        outline = compute_outline(corners)
+        axes.add_patch(Polygon(outline, fill=False, edgecolor=red, linewidth=2.0, zorder=6))
+
+
+def _draw_approach(axes: Axes, approach: Approach) -> None:
+    """Draw the arrow of an approach, and a line from the base if it is reachable."""
+    colour = _choose_colour(approach)
+    x, y = approach.at[:2].tolist()
+    arrow = {"arrowstyle": "->", "color": colour, "linewidth": 1.8}
+    axes.annotate("", (x, y), _find_tail(approach), arrowprops=arrow, zorder=7)
+    if approach.base is not None:
+        base_x, base_y = approach.base[:2]
+        axes.plot([base_x, x], [base_y, y], ":", color=colour, linewidth=0.8, zorder=5)
+        axes.plot(base_x, base_y, "o", color=colour, markersize=4, zorder=7)
+
+
+def _add_label(labels: list[_Label], approach: Approach) -> None:
+    """Add an approach to a label beside it, or a new label."""
+    owner, _, attachment = approach.name.partition(".")
+    colour = _choose_colour(approach)
+    tail = _find_tail(approach)
+    for label in labels:
+        is_alike = label.owner == owner and label.colour == colour
+        if is_alike and math.dist(label.at, tail) < _BESIDE:
+            label.text = f"{label.text}, {attachment}"
+            return
+    labels.append(_Label(approach.name, owner, tail, colour))
+
+
+def _add_legend(figure: Figure, labels: Sequence[_Label]) -> None:
+    """Add a legend of numbers and names."""
+    from matplotlib.lines import Line2D
+
+    handles: list[Line2D] = []
+    for number, label in enumerate(labels, 1):
+        text = textwrap.fill(label.text, _LETTERS)
+        handles.append(
+            Line2D([], [], linestyle="", marker=f"${number}$", color=label.colour, label=text)
+        )
+    figure.legend(handles=handles, loc="outside right upper", fontsize=7)
+
+
+def _fit(figure: Figure, places: Sequence[tuple[float, float]]) -> None:
+    """Set the limits to the content within the arena, and the figure's size to their ratio.
+
+    Args:
+        figure: Figure of one plot.
+        places: Positions of labels, which need a legend.
+    """
     (axes,) = figure.axes
-    low, high = np.array(axes.dataLim.min), np.array(axes.dataLim.max)
-    arena = np.array([axes.get_xlim(), axes.get_ylim()]).T
-    low, high = np.maximum(low - _MARGIN, arena[0]), np.minimum(high + _MARGIN, arena[1])
+    arena_low, arena_high = np.array([axes.get_xlim(), axes.get_ylim()]).T
+    low = np.maximum(np.array(axes.dataLim.min) - _MARGIN, arena_low)
+    high = np.minimum(np.array(axes.dataLim.max) + _MARGIN, arena_high)
     if places:
-        low = np.minimum(low, np.min(places, axis=0) - _BEYOND)
-        high = np.maximum(high, np.max(places, axis=0) + _BEYOND)
+        low = np.minimum(low, np.min(places, axis=0) - _LABEL_MARGIN)
+        high = np.maximum(high, np.max(places, axis=0) + _LABEL_MARGIN)
     axes.set_xlim(low[0], high[0])
     axes.set_ylim(low[1], high[1])
     width, height = np.maximum(_LARGE * (high - low) / (high - low).max(), _SMALL)
-    figure.set_size_inches(width + _FRAME + _LEGEND * has_legend, height + _FRAME)
-
-
-def _wrap(text: str) -> str:
-    return textwrap.fill(text, _LETTERS)
+    legend = _LEGEND if places else 0.0
+    figure.set_size_inches(width + _FRAME + legend, height + _FRAME)

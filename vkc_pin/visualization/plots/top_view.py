@@ -19,9 +19,21 @@ if TYPE_CHECKING:
     from matplotlib.figure import FigureBase
 
 
-_STEP = 0.55  # travel between two drawn footprints [m]
-_ROBOT_HEIGHT = 1.8  # obstacles above this height are drawn dashed [m]
-_START, _END, _TOOL, _BASE = "#3a6bc4", "#1a9961", "#e03359", "#2b5f9e"
+# [m] travel between two drawn footprints
+_STEP = 0.55
+# at most so many steps
+_MAX_STEPS = 14
+# [m] obstacles above this height are drawn dashed
+_ROBOT_HEIGHT = 1.8
+# [m] length of the arrow that shows the heading
+_ARROW = 0.45
+# times at which paths are drawn
+_SAMPLES = 400
+# colours of footprints at both ends, and of paths
+_START = "#3a6bc4"
+_END = "#1a9961"
+_TOOL = "#e03359"
+_BASE = "#2b5f9e"
 
 
 def draw_top_view(
@@ -42,12 +54,13 @@ def draw_top_view(
         if shape.parentJoint or world.collision_labels[i] == FLOOR:
             continue
         points = _place_vertices(world, i, np.eye(4), {})
-        high = points[:, 2].min() > _ROBOT_HEIGHT
-        paint = (*np.clip(shape.meshColor[:3], 0.0, 1.0), 0.75)
-        style: dict[str, Any] = {"fill": False, "linestyle": "--"} if high else {"facecolor": paint}
-        axes.add_patch(
-            Polygon(compute_outline(points), edgecolor="0.45", linewidth=0.7, zorder=1, **style)
-        )
+        style: dict[str, Any] = {"edgecolor": "0.45", "linewidth": 0.7, "zorder": 1}
+        if points[:, 2].min() > _ROBOT_HEIGHT:
+            style["fill"] = False
+            style["linestyle"] = "--"
+        else:
+            style["facecolor"] = (*np.clip(shape.meshColor[:3], 0.0, 1.0), 0.75)
+        axes.add_patch(Polygon(compute_outline(points), **style))
 
     _draw_motion(axes, world, trajectory)
     x_min, x_max, y_min, y_max = world.scene.arena
@@ -67,55 +80,48 @@ def _draw_motion(axes: Axes, world: World, trajectory: Trajectory | None) -> Non
 
     times = np.zeros(1) if trajectory is None else _choose_times(trajectory)
     motion = sample_motion(world, trajectory, times)
-    shades = LinearSegmentedColormap.from_list("time", [_START, _END])(
-        np.linspace(0.0, 1.0, len(times))
-    )
-    robot, moving = [], []
-    cache: dict[int, Floats] = {}
+    colours = LinearSegmentedColormap.from_list("time", [_START, _END])
+    base_shapes: list[int] = []
+    object_shapes: list[int] = []
     for i, shape in enumerate(world.shapes):
         if shape.parentJoint == 1:
-            robot.append(i)
+            base_shapes.append(i)
         elif shape.parentJoint and "." in world.collision_labels[i]:
-            moving.append(i)
-    for k, colour in enumerate(shades):
-        ends = k in (0, len(times) - 1)
-        base = np.concatenate([_place_vertices(world, i, motion.world[k, 1], cache) for i in robot])
-        drawn = {"edgecolor": colour, "linewidth": 1.6 if ends else 0.8, "zorder": 3}
-        label = "start" if k == 0 else "end" if k == len(times) - 1 else None
-        axes.add_patch(
-            Polygon(
-                compute_outline(base),
-                facecolor=(*colour[:3], 0.22 if ends else 0.05),
-                label=label,
-                **drawn,
-            )
-        )
-        if ends:
-            tail, nose = (
-                motion.world[k, 1] @ np.array([[0.0, 0.0, 0.0, 1.0], [0.45, 0.0, 0.0, 1.0]]).T
-            )[:2].T
+            object_shapes.append(i)
+    cache: dict[int, Floats] = {}
+    for k, colour in enumerate(colours(np.linspace(0.0, 1.0, len(times)))):
+        is_end = k in (0, len(times) - 1)
+        style = {"edgecolor": colour, "linewidth": 1.6 if is_end else 0.8, "zorder": 3}
+        base = motion.world[k, 1]
+        corners = np.concatenate([_place_vertices(world, i, base, cache) for i in base_shapes])
+        label = None
+        if is_end:
+            label = "start" if k == 0 else "end"
+        paint = (*colour[:3], 0.22 if is_end else 0.05)
+        axes.add_patch(Polygon(compute_outline(corners), facecolor=paint, label=label, **style))
+        if is_end:
+            # The columns are the ends of the arrow in the base's frame.
+            ends = base @ np.array([[0.0, 0.0, 0.0, 1.0], [_ARROW, 0.0, 0.0, 1.0]]).T
+            tail, nose = ends[:2].T
             arrow = {"arrowstyle": "->", "color": colour, "linewidth": 1.6}
             axes.annotate("", nose, tail, arrowprops=arrow, zorder=4)
-        for i in moving:
+        for i in object_shapes:
             joint = world.shapes[i].parentJoint
-            if not ends and np.allclose(
-                motion.world[k, joint], motion.world[k - 1, joint], atol=1e-3
-            ):
+            placement = motion.world[k, joint]
+            if not is_end and np.allclose(placement, motion.world[k - 1, joint], atol=1e-3):
                 continue
-            corners = _place_vertices(world, i, motion.world[k, joint], cache)
-            axes.add_patch(
-                Polygon(
-                    compute_outline(corners),
-                    facecolor=(*colour[:3], 0.35 if ends else 0.1),
-                    **drawn,
-                )
-            )
-    if trajectory is None:
-        return
-    fine = sample_motion(
-        world, trajectory, np.linspace(trajectory.times[0], trajectory.times[-1], 400)
-    )
-    paths = (("base", fine.base, _BASE), ("tool", fine.tool, _TOOL))
+            corners = _place_vertices(world, i, placement, cache)
+            paint = (*colour[:3], 0.35 if is_end else 0.1)
+            axes.add_patch(Polygon(compute_outline(corners), facecolor=paint, **style))
+    if trajectory is not None:
+        _draw_paths(axes, world, trajectory)
+
+
+def _draw_paths(axes: Axes, world: World, trajectory: Trajectory) -> None:
+    """Draw the paths of base and tool, with a dot at the start and a square at the end."""
+    times = np.linspace(trajectory.times[0], trajectory.times[-1], _SAMPLES)
+    motion = sample_motion(world, trajectory, times)
+    paths = (("base", motion.base, _BASE), ("tool", motion.tool, _TOOL))
     for name, path, colour in paths:
         label = f"path of the {name}"
         axes.plot(*path[:, :2].T, color=colour, linewidth=1.6, zorder=4, label=label)
@@ -126,21 +132,17 @@ def _draw_motion(axes: Axes, world: World, trajectory: Trajectory | None) -> Non
 
 def _choose_times(trajectory: Trajectory) -> Floats:
     """Choose times at equal steps of the travel of base and objects."""
-    fine = np.linspace(trajectory.times[0], trajectory.times[-1], 400)
-    rows = trajectory.at(fine)
-    objects = np.abs(np.diff(rows[:, trajectory.robot_size :], axis=0)).sum(axis=1)
-    travel = (
-        np.hypot(*np.diff(rows[:, :2], axis=0).T)
-        + 0.3 * np.abs(np.diff(rows[:, 2]))
-        + 0.5 * objects
-    )
-    passed = np.concatenate([[0.0], np.cumsum(travel)])
-    count = int(np.clip(np.ceil(passed[-1] / _STEP), 1, 14))
-    return (
-        np.unique(np.interp(np.linspace(0.0, passed[-1], count + 1), passed, fine))
-        if passed[-1] > 0.0
-        else fine[[0, -1]]
-    )
+    times = np.linspace(trajectory.times[0], trajectory.times[-1], _SAMPLES)
+    positions = trajectory.at(times)
+    drive = np.hypot(*np.diff(positions[:, :2], axis=0).T)
+    turn = np.abs(np.diff(positions[:, 2]))
+    objects = np.abs(np.diff(positions[:, trajectory.robot_size :], axis=0)).sum(axis=1)
+    travel = np.concatenate([[0.0], np.cumsum(drive + 0.3 * turn + 0.5 * objects)])
+    total = travel[-1]
+    if not total > 0.0:
+        return times[[0, -1]]
+    count = int(np.clip(np.ceil(total / _STEP), 1, _MAX_STEPS))
+    return np.unique(np.interp(np.linspace(0.0, total, count + 1), travel, times))
 
 
 def _place_vertices(world: World, index: int, joint: Floats, cache: dict[int, Floats]) -> Floats:

@@ -27,16 +27,33 @@ EPISODES_A_SHARD = 100
 """Episodes in one shard; the last one of each robot may have fewer."""
 FOLDERS = ("lerobot", "robots", "scenes", "shards", "work")
 """Folders in that of a dataset."""
-MEMBERS = (
-    *FOLDERS,
-    *("README.md", "episodes.csv", "failures.csv", "journal.jsonl", "recipe.yaml"),
-)
+_FILES = ("README.md", "episodes.csv", "failures.csv", "journal.jsonl", "recipe.yaml")
+MEMBERS = (*FOLDERS, *_FILES)
 """Files and folders in that of a dataset, but for its page of statistics."""
 _COLUMNS = (
-    *("number", "task", "robot", "room", "object", "kind", "attachment", "joint", "goal"),
-    *("variant", "status", "reason", "duration", "base_path_length", "arm_path_length"),
-    *("clearance", "waypoints", "scene", "seconds", "planning_time"),
+    "number",
+    "task",
+    "robot",
+    "room",
+    "object",
+    "kind",
+    "attachment",
+    "joint",
+    "goal",
+    "variant",
+    "status",
+    "reason",
+    "duration",
+    "base_path_length",
+    "arm_path_length",
+    "clearance",
+    "waypoints",
+    "scene",
+    "seconds",
+    "planning_time",
 )
+# Fields that the record of an episode has, and that of a failure may lack.
+_REQUIRED = ("task", "robot", "room", "object", "kind", "goal", "scene", "way", "duration")
 
 
 class _AttemptSchema(BaseModel):
@@ -69,12 +86,13 @@ class _AttemptSchema(BaseModel):
 
     @model_validator(mode="after")
     def _check_success(self) -> Self:
-        needed = ("task", "robot", "room", "object", "kind", "goal", "scene", "way", "duration")
-        missing = [name for name in needed if getattr(self, name) is None]
-        if self.success and missing:
-            raise make_validation_error(f"{missing[0]} is missing", "that of an episode")
-        if self.way is not None and (not self.way or len({len(row) for row in self.way}) > 1):
-            raise make_validation_error("`way` is no table", "rows of equal length")
+        for name in _REQUIRED:
+            if self.success and getattr(self, name) is None:
+                raise make_validation_error(f"{name} is missing", "that of an episode")
+        if self.way is not None:
+            lengths = {len(row) for row in self.way}
+            if len(lengths) != 1:
+                raise make_validation_error("`way` is no table", "rows of equal length")
         return self
 
 
@@ -189,12 +207,14 @@ class Register:
     """
 
     def __init__(self, dataset: Dataset, wanted: int) -> None:
-        self.dataset, self.wanted = dataset, wanted
+        self.dataset = dataset
+        self.wanted = wanted
         self.accepted: list[Mapping[str, Any]] = []
         self.failures: list[Mapping[str, Any]] = []
         self._shards: dict[Path, list[Mapping[str, Any]]] = {}  # folder → rows of its episodes
         self._pending: dict[int, Mapping[str, Any]] = {}
-        self._next, self._duplicates = 0, DuplicateFinder()
+        self._next = 0
+        self._duplicates = DuplicateFinder()
 
     @property
     def full(self) -> bool:
@@ -215,18 +235,20 @@ class Register:
 
     def _decide(self, record: Mapping[str, Any]) -> None:
         if not record["success"]:
-            self.failures.append(_row(record))
+            self.failures.append(_select_columns(record))
             return
         duplicate = self._duplicates.find_duplicate(record)
         if duplicate is not None:
             reason = f"nearly the same motion as that of episode {duplicate}"
-            self.failures.append(_row({**record, "status": "duplicate", "reason": reason}))
+            rejected = {**record, "status": "duplicate", "reason": reason}
+            self.failures.append(_select_columns(rejected))
             return
         name = check_name(record.get("robot"), "robot", file=self.dataset.folder / "journal.jsonl")
         folder = self.dataset.folder / "shards" / name
-        self.accepted.append(_row(record))
+        row = _select_columns(record)
+        self.accepted.append(row)
         rows = self._shards.setdefault(folder, [])
-        rows.append(self.accepted[-1])
+        rows.append(row)
         if len(rows) % EPISODES_A_SHARD == 0:
             self._write(folder, len(rows) // EPISODES_A_SHARD - 1)
 
@@ -243,32 +265,31 @@ class Register:
 
         The work files of a full shard are deleted.
         """
-        rows = self._shards[folder][k * EPISODES_A_SHARD : (k + 1) * EPISODES_A_SHARD]
+        first = k * EPISODES_A_SHARD
+        rows = self._shards[folder][first : first + EPISODES_A_SHARD]
         numbers = [int(row["number"]) for row in rows]
         scenes = self.dataset.folder / "scenes"
-        lost = {
-            name for name in {row["scene"] for row in rows} if not has_intact_scene(scenes, name)
-        }
+        names = {row["scene"] for row in rows}
+        lost = {name for name in names if not has_intact_scene(scenes, name)}
         for name in lost:  # a damaged file would stay
             (scenes / f"{name}.json").unlink(missing_ok=True)
         path = folder / f"shard-{k:05d}.hdf5"
         files = [get_work_file(self.dataset.folder, number) for number in numbers]
         existing = read_intact_numbers(path)
         if existing != numbers or lost:
-            # Episodes whose work file was removed may be in the shard that is replaced.
-            parts = [
-                (path, existing.index(number))
-                if number in existing and row["scene"] not in lost
-                else (file, 0)  # it also has the scene
-                for file, number, row in zip(files, numbers, rows, strict=True)
-            ]
+            parts = list[tuple[Path, int]]()
+            for file, number, row in zip(files, numbers, rows, strict=True):
+                # Episodes whose work file was removed may be in the shard that is replaced.
+                # A lost scene is in the work file, too.
+                is_in_shard = number in existing and row["scene"] not in lost
+                parts.append((path, existing.index(number)) if is_in_shard else (file, 0))
             write_shard(path, parts, scenes)
         if len(numbers) == EPISODES_A_SHARD:
             for file in files:
                 file.unlink(missing_ok=True)
 
 
-def _row(record: Mapping[str, Any]) -> dict[str, Any]:
+def _select_columns(record: Mapping[str, Any]) -> dict[str, Any]:
     """Return the fields of a record that tables contain, to save memory."""
     return {name: record[name] for name in _COLUMNS if name in record}
 
@@ -299,6 +320,7 @@ def read_table(path: Path) -> list[dict[str, str]]:
     if tuple(table.fieldnames or ()) != _COLUMNS:
         raise InputError("wrong columns", file=path, expected=expected, got=table.fieldnames)
     for line, row in enumerate(rows, start=2):
+        # csv has None for cells that are missing, and as the key of those that are too many.
         is_whole = None not in row and None not in row.values()
         if not is_whole or not re.fullmatch(r"\d{1,18}", row["number"], re.ASCII):
             raise InputError("an invalid row", file=path, line=line, expected=expected)

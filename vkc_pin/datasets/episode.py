@@ -36,11 +36,13 @@ from vkc_pin.world.task.terms import Term
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.trajectory import MOST_SAMPLES, Trajectory
 
-_PLANNER = {"entries": 512, "megabytes": 96.0}
+_MAX_ENTRIES = 512  # of a planner's cache
+_MAX_MEGABYTES = 96.0  # of a planner's cache
 _DIGITS = 12  # digits of a scene's name
 # [m], [rad], [m/s], ...: trajectories are rounded to 0.5e-9; smaller digits are noise, which does
 # not compress.
 _GRID = 2.0**-30
+_PERTURBATION = 0.05  # [m], [rad] noise of initial guesses of further variants
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +93,9 @@ class Episode:
             robot = dict(self.document["robot"])
             if self.robots is not None:
                 file = self.robots / check_name(robot["name"], "robot.name") / "robot.yaml"
-                # absolute: a scene's relative paths begin at the folder of its description
-                robot["name"] = str(file.resolve()) if file.is_file() else robot["name"]
+                if file.is_file():
+                    # Relative paths of a scene begin at the folder of its description.
+                    robot["name"] = str(file.resolve())
             document = {**self.document, "robot": robot, "start": self.start}
             return Scene.from_document(document, self.where or find_resource_folder("scenes"))
 
@@ -104,7 +107,7 @@ class Episode:
 @functools.cache
 def _get_planner() -> Planner:
     """Return this process's planner."""
-    return Planner(entries=int(_PLANNER["entries"]), megabytes=_PLANNER["megabytes"])
+    return Planner(entries=_MAX_ENTRIES, megabytes=_MAX_MEGABYTES)
 
 
 @functools.lru_cache(maxsize=4)
@@ -177,25 +180,23 @@ def _plan_problem(problem: Problem, recipe: Recipe) -> Plan:
     )
 
 
-_PERTURBATION = 0.05  # [m], [rad] noise of initial guesses of further variants
-
-
-def _record_plan(plan_result: Plan) -> dict[str, Any]:
-    worst = [str(one) for one in plan_result.report.violations[:1]]
-    reason = (
-        ""
-        if plan_result.success
-        else "; ".join([*worst, *plan_result.report.notes[:2]]) or plan_result.status
-    )
+def _record_plan(planned: Plan) -> dict[str, Any]:
+    """Return the fields of an attempt's record that describe planning."""
+    reason = ""
+    if not planned.success:
+        reasons = [str(violation) for violation in planned.report.violations[:1]]
+        reasons += planned.report.notes[:2]
+        reason = "; ".join(reasons) or planned.status
+    metrics = planned.metrics
     return {
-        "success": plan_result.success,
-        "status": plan_result.status,
+        "success": planned.success,
+        "status": planned.status,
         "reason": reason,
-        "planning_time": round(plan_result.metrics["planning_time"], 4),
-        "build_time": round(plan_result.metrics["build_time"], 4),
-        "validation_time": round(plan_result.metrics["time_validation"], 4),
-        "evaluations": int(plan_result.metrics["evaluations"]),
-        "initialization": plan_result.initialization,
+        "planning_time": round(metrics["planning_time"], 4),
+        "build_time": round(metrics["build_time"], 4),
+        "validation_time": round(metrics["time_validation"], 4),
+        "evaluations": int(metrics["evaluations"]),
+        "initialization": planned.initialization,
     }
 
 
@@ -217,15 +218,16 @@ def sample_times(motion: Trajectory, rate: float) -> Floats:
     Raises:
         InputError: There are too many.
     """
-    count = np.ceil((motion.times[-1] - motion.times[0]) * rate) + 1.0
+    first = motion.times[0]
+    last = motion.times[-1]
+    count = np.ceil((last - first) * rate) + 1.0
     if count > MOST_SAMPLES:
         expected = f"a motion of at most {MOST_SAMPLES} samples at {rate:g} Hz"
         raise InputError("too long a motion", field="motion", expected=expected, got=f"{count:g}")
-    count = int(count)
-    return np.minimum(motion.times[0] + np.arange(count) / rate, motion.times[-1])
+    return np.minimum(first + np.arange(int(count)) / rate, last)
 
 
-def _select_metrics(plan_result: Plan) -> dict[str, float]:
+def _select_metrics(planned: Plan) -> dict[str, float]:
     """Return a plan's metrics that do not depend on the machine."""
     names = (
         "base_path_length",
@@ -236,11 +238,8 @@ def _select_metrics(plan_result: Plan) -> dict[str, float]:
         "duration",
         "evaluations",
     )
-    return {
-        name: float(plan_result.metrics[name])
-        for name in names
-        if np.isfinite(plan_result.metrics[name])
-    }
+    metrics = planned.metrics
+    return {name: float(metrics[name]) for name in names if np.isfinite(metrics[name])}
 
 
 def compute_scene_name(document: Mapping[str, Any]) -> str:

@@ -116,18 +116,20 @@ def generate(  # noqa: PLR0913 - keyword options of a public call
             for robot in (folder / "lerobot").iterdir():
                 check_replaceable(robot)
         dataset = Dataset(folder, loaded)
-        numbers = {n for shard in dataset.shards for n in read_intact_numbers(shard)}
-        if (existing := len(numbers)) > wanted:
+        existing = set[int]()
+        for shard in dataset.shards:
+            existing.update(read_intact_numbers(shard))
+        if len(existing) > wanted:
             raise InputError(
                 "the dataset already has more episodes",
                 file=folder,
                 field="episodes",
-                expected=f"at least {existing}",
+                expected=f"at least {len(existing)}",
                 got=wanted,
             )
         _prepare_folder(folder, loaded)
         register = Register(dataset, wanted)
-        for key in _find_lost(dataset, journal, numbers):
+        for key in _find_lost(dataset, journal, existing):
             del journal.lines[key]  # they are generated again
         for key in sorted(journal.lines, key=int):
             register.add(_get_record(journal, key))
@@ -151,7 +153,8 @@ def _load_recipe(
     loaded = load_recipe(recipe, **changes)
     if check_bool(cameras, "cameras") and not loaded.fields.cameras:
         loaded = load_recipe(loaded, cameras=CAMERAS)
-    if entries := make_entries(terms):
+    entries = make_entries(terms)
+    if entries:
         loaded = load_recipe(loaded, terms=[*loaded.document["terms"], *entries])
     require_h5py()
     if loaded.fields.simulate:
@@ -202,13 +205,17 @@ def _get_record(journal: Journal, key: str) -> dict[str, Any]:
 def _find_lost(dataset: Dataset, journal: Journal, existing: Set[int]) -> list[str]:
     """Return successful episodes of the journal that neither work file nor shard and scene hold."""
     is_intact = functools.cache(functools.partial(has_intact_scene, dataset.folder / "scenes"))
-    return [
-        key
-        for key in journal.lines
-        if (record := _get_record(journal, key))["success"]
-        and not (int(key) in existing and is_intact(record["scene"]))
-        and read_intact_numbers(get_work_file(dataset.folder, int(key))) != [int(key)]
-    ]
+    found = list[str]()
+    for key in journal.lines:
+        record = _get_record(journal, key)
+        number = int(key)
+        if not record["success"]:
+            continue
+        if number in existing and is_intact(record["scene"]):
+            continue
+        if read_intact_numbers(get_work_file(dataset.folder, number)) != [number]:
+            found.append(key)
+    return found
 
 
 def _run_attempts(
@@ -220,31 +227,38 @@ def _run_attempts(
     progress: bool,
 ) -> None:
     """Run attempts in the order of their numbers until there are enough episodes."""
-    fields, clock, retried = dataset.recipe.fields, _Clock(), deque[int]()
+    fields = dataset.recipe.fields
     size = fields.rooms.episodes * fields.variants
+    clock = _Clock()
+    retried = deque[int]()
     robots = prepare_robots(dataset.recipe, dataset.folder / "robots")
     journal.append({"session": {"jobs": jobs}})
-    done = len(register.accepted)
-    shown: dict[str, Any] = {"unit": "episode", "smoothing": 0.05, "disable": not progress}
-    bar = tqdm(total=register.wanted, initial=done, **shown)
+    bar = tqdm(
+        total=register.wanted,
+        initial=len(register.accepted),
+        unit="episode",
+        smoothing=0.05,
+        disable=not progress,
+    )
     outcomes = run_tasks(
         make_parts,
         _iterate_tasks(dataset, register, journal, clock, retried, robots),
         jobs=jobs,
         scheduler=scheduler,
         limit=_WATCHDOG * size * fields.time_limit,
-        tell=(lambda line: tqdm.write(line, file=sys.stderr)) if progress else None,
+        tell=functools.partial(tqdm.write, file=sys.stderr) if progress else None,
     )
     try:
         with bar, contextlib.closing(outcomes) as lines:
             for key, result in lines:
                 numbers = [int(number) for number in key.split(",")]
-                # Run each number alone to find the one that ended the process.
-                if isinstance(result, CrashedTask) and len(numbers) > 1:
-                    retried.extend(numbers)
-                    continue
-                crashed = isinstance(result, CrashedTask)
-                for record, data in [_make_failure(numbers[0], result)] if crashed else result:
+                if isinstance(result, CrashedTask):
+                    if len(numbers) > 1:
+                        # Each is run alone, to find the one that ended the process.
+                        retried.extend(numbers)
+                        continue
+                    result = [_make_failure(numbers[0], result)]
+                for record, data in result:
                     if record["status"] == "interrupted":
                         raise KeyboardInterrupt
                     _save(dataset, journal, record, data, clock)
@@ -269,7 +283,8 @@ def _iterate_tasks(
     robots: Mapping[str, str],
 ) -> Iterator[tuple[str, Any]]:
     """Yield keys and tasks of blocks of attempts until there are enough; `retried` come first."""
-    document, fields = dataset.recipe.document, dataset.recipe.fields
+    document = dataset.recipe.document
+    fields = dataset.recipe.fields
     max_attempts = max(_MIN_ATTEMPTS, _MAX_ATTEMPTS_PER_EPISODE * register.wanted)
     size = fields.rooms.episodes * fields.variants
     clock.start()  # the processes are running now
@@ -301,17 +316,19 @@ class _Clock:
         self.start()
 
     def start(self) -> None:
-        self._began, self._worked = time.perf_counter(), time.process_time()
+        self._start_time = time.perf_counter()
+        self._start_cpu_time = time.process_time()
 
     def subtract(self, record: Mapping[str, Any]) -> None:
         """Subtract the CPU time of an attempt that this process ran."""
         if record.get("process") == identify_process():
-            self._worked += float(record["cpu_time"])
+            self._start_cpu_time += float(record["cpu_time"])
 
     @property
     def now(self) -> dict[str, float]:
         """Wall and client times, as in the journal [s]."""
-        seconds, client = time.perf_counter() - self._began, time.process_time() - self._worked
+        seconds = time.perf_counter() - self._start_time
+        client = time.process_time() - self._start_cpu_time
         return {"seconds": round(seconds, 3), "client_seconds": round(client, 4)}
 
 
@@ -322,12 +339,11 @@ def _save(
     if data:
         write_atomically(get_work_file(dataset.folder, record["number"]), data)
     clock.subtract(record)
-    memory: dict[str, Any] = {
-        name: record.pop(name) for name in ("memory_mb", "resident_mb", "process") if name in record
-    }
-    journal.append(
-        {"key": str(record["number"]), "records": [record], "memory_mb": 0.0, **memory, **clock.now}
-    )
+    line: dict[str, Any] = {"key": str(record["number"]), "records": [record], "memory_mb": 0.0}
+    for name in ("memory_mb", "resident_mb", "process"):
+        if name in record:
+            line[name] = record.pop(name)
+    journal.append({**line, **clock.now})
 
 
 def _make_failure(number: int, outcome: CrashedTask) -> Made:

@@ -23,7 +23,6 @@ from vkc_pin.utils.arguments import (
 CheckRecords = Callable[[str, list[dict[str, Any]]], object]
 """Raises an `InputError` for invalid records of a task, given its key and them."""
 
-
 _MAX_LINE = 50_000_000  # [bytes]
 
 
@@ -71,7 +70,8 @@ class JournalContents:
     """
 
     def __init__(self, path: Path, check_records: CheckRecords | None = None) -> None:
-        self._path, self._check_records = path, check_records
+        self._path = path
+        self._check_records = check_records
         self.lines = Records(path)
         self.sessions: list[dict[str, Any]] = []
         self.memory = 0.0
@@ -106,10 +106,11 @@ class JournalContents:
         end = 0
         for number in itertools.count(1):
             text = stream.readline(_MAX_LINE)
-            if not text.endswith(b"\n") and len(text) < _MAX_LINE:
+            is_too_long = len(text) == _MAX_LINE
+            if not text.endswith(b"\n") and not is_too_long:
                 break
             try:
-                if len(text) == _MAX_LINE:
+                if is_too_long:
                     raise InputError("too long", expected=f"at most {_MAX_LINE:g} bytes")
                 line = json.loads(text)
                 if number == 1:
@@ -140,18 +141,15 @@ class JournalContents:
         key = check_text(line.get("key"), "key")
         records = check_instance(line.get("records"), list, "records")
         check_list(records, "records", "a list of records", dict)
-        if self._check_records is not None and number is not None:
-            try:
-                self._check_records(key, records)
-            except InputError as error:
-                place: Any = {"file": self._path, "line": number, "field": error.field}
-                raise InputError(
-                    error.problem, **place, expected=error.expected, got=error.got
-                ) from error
-        known = {name: line[name] for name in ("client_seconds", "resident_mb") if name in line}
-        numbers = {"memory_mb": line.get("memory_mb"), "seconds": line.get("seconds"), **known}
-        numbers = {name: check_number(value, name) for name, value in numbers.items()}
-        process = check_text(line["process"], "process") if "process" in line else None
+        if number is not None:
+            self._check_task(key, records, number)
+        numbers = {name: check_number(line.get(name), name) for name in ("memory_mb", "seconds")}
+        for name in ("client_seconds", "resident_mb"):
+            if name in line:
+                numbers[name] = check_number(line[name], name)
+        process = None
+        if "process" in line:
+            process = check_text(line["process"], "process")
         session = self.sessions[-1]
         self.lines.add(key, offset)
         self.memory = max(self.memory, numbers["memory_mb"])
@@ -162,6 +160,22 @@ class JournalContents:
         if process is not None:
             self.processes[key] = process
             self.memories.setdefault(process, []).append(numbers["resident_mb"])
+
+    def _check_task(self, key: str, records: list[dict[str, Any]], number: int) -> None:
+        """Check the records of a task in a line of the file."""
+        if self._check_records is None:
+            return
+        try:
+            self._check_records(key, records)
+        except InputError as error:
+            raise InputError(
+                error.problem,
+                file=self._path,
+                line=number,
+                field=error.field,
+                expected=error.expected,
+                got=error.got,
+            ) from error
 
 
 class Journal(JournalContents):
@@ -194,7 +208,8 @@ class Journal(JournalContents):
         except BlockingIOError:
             problem = "another run is writing to this folder; wait for it, or use another"
             raise InputError(problem, file=path) from None
-        self._stream, self._kind = stream, kind
+        self._stream = stream
+        self._kind = kind
         self._header = json.loads(json.dumps(header))
         stream.seek(0)
         self._end = self._parse(path, stream)
@@ -214,14 +229,17 @@ class Journal(JournalContents):
         """Check that a file without a complete line is a part of the header."""
         header = _encode_line(self._header)
         self._stream.seek(0)
-        if not header.startswith(begun := self._stream.read(len(header))):
+        begun = self._stream.read(len(header))
+        if not header.startswith(begun):
             expected = "a new file, or the lines that a run writes"
             got = begun[:80].decode(errors="replace")
             raise InputError("not a journal", file=self._path, line=1, expected=expected, got=got)
 
     def _write(self, line: Mapping[str, Any]) -> None:
-        text, done = _encode_line(line), 0
-        try:  # past the buffer, which would raise once more when the stream is closed
+        text = _encode_line(line)
+        done = 0
+        try:
+            # Past the buffer, which would raise once more when the stream is closed.
             while done < len(text):
                 done += os.write(self._stream.fileno(), text[done:])
         except OSError as error:
@@ -232,34 +250,45 @@ class Journal(JournalContents):
 
     def _check_header(self, header: Mapping[str, Any]) -> None:
         """Raise an error that names the differences to this journal's header."""
-        old, new = _flatten(check_mapping(header, "header")), _flatten(self._header)
+        old = _flatten(check_mapping(header, "header"))
+        new = _flatten(self._header)
         differing = [name for name in {**old, **new} if old.get(name) != new.get(name)]
-        if differing:
-            named = [name for name in differing if name != "specification"] or differing
-            named = ["benchmark"] if "benchmark" in named else named  # others have other settings
-            was, now = (
-                ", ".join(f"{name.rpartition('.')[2]} {side.get(name)}" for name in named)
-                for side in (old, new)
-            )
-            problem = (
-                f"the {self._kind} in this folder were run otherwise; "
-                f"use another folder than {self._path.parent}"
-            )
-            field = ", ".join(named)
-            raise InputError(problem, file=self._path, field=field, expected=was, got=now)
+        if not differing:
+            return
+        # Other settings change the digest of all trials, too.
+        named = [name for name in differing if name != "specification"] or differing
+        if "benchmark" in named:  # others have other settings
+            named = ["benchmark"]
+        problem = (
+            f"the {self._kind} in this folder were run otherwise; "
+            f"use another folder than {self._path.parent}"
+        )
+        raise InputError(
+            problem,
+            file=self._path,
+            field=", ".join(named),
+            expected=_format_entries(old, named),
+            got=_format_entries(new, named),
+        )
 
 
 def _encode_line(data: Mapping[str, Any]) -> bytes:
     return json.dumps(data, allow_nan=False).encode() + b"\n"
 
 
+def _format_entries(flat: Mapping[str, Any], names: list[str]) -> str:
+    """Return entries of a flat header as text, "pin 4.1.0, seed 3"."""
+    return ", ".join(f"{name.rpartition('.')[2]} {flat.get(name)}" for name in names)
+
+
 def _flatten(data: Mapping[str, Any]) -> dict[str, Any]:
     """Return the entries of a header: settings by their own name, others as "versions.pin"."""
     flat: dict[str, Any] = {}
     for name, value in data.items():
-        prefix = "" if name == "settings" else f"{name}."
-        if isinstance(value, Mapping):
-            flat |= {f"{prefix}{key}": item for key, item in value.items()}
-        else:
+        if not isinstance(value, Mapping):
             flat[name] = value
+            continue
+        prefix = "" if name == "settings" else f"{name}."
+        for key, item in value.items():
+            flat[f"{prefix}{key}"] = item
     return flat

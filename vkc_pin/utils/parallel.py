@@ -51,10 +51,16 @@ def check_processes(jobs: int, scheduler: str | None) -> None:
     """
     if scheduler is None and jobs == 1:
         return
-    field = "jobs" if scheduler is None else "scheduler"
-    if scheduler is not None and not (isinstance(scheduler, str) and _ADDRESS.fullmatch(scheduler)):
-        expected, got = "such as tcp://HOST:8786", format_value(scheduler)
-        raise InputError("not an address", field=field, expected=expected, got=got)
+    field = "jobs"
+    if scheduler is not None:
+        field = "scheduler"
+        if not isinstance(scheduler, str) or not _ADDRESS.fullmatch(scheduler):
+            raise InputError(
+                "not an address",
+                field=field,
+                expected="such as tcp://HOST:8786",
+                got=format_value(scheduler),
+            )
     import_optional("distributed", "cluster", purpose="running in other processes", field=field)
 
 
@@ -113,7 +119,8 @@ def _run_on_cluster(
         if tell is not None:
             tell(f"Dask's dashboard: {client.dashboard_link}")
         run = _ClusterRun(client, function, iter(tasks), limit)
-        run.submit_tasks(None if scheduler else jobs)
+        workers = None if scheduler else jobs
+        run.submit_tasks(workers)
         try:
             while run.running:
                 try:
@@ -125,9 +132,10 @@ def _run_on_cluster(
                         tell(f"{scheduler} has no workers; waiting for some")
                         tell = None
                     continue
-                if (outcome := run.collect(future)) is not None:
+                outcome = run.collect(future)
+                if outcome is not None:
                     yield outcome
-                run.submit_tasks(None if scheduler else jobs)
+                run.submit_tasks(workers)
         finally:
             client.cancel([future for *_, future in run.running.values()], force=True)
 
@@ -138,26 +146,32 @@ class _ClusterRun:
     def __init__(
         self, client: Any, function: Function, tasks: Iterator[tuple[str, Any]], limit: float | None
     ) -> None:
-        self.client, self.function, self.tasks, self.limit = client, function, tasks, limit
+        self.client = client
+        self.function = function
+        self.tasks = tasks
+        self.limit = limit
         self.running: dict[str, tuple[str, Any, Any]] = {}
         self.ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self.suspects: list[tuple[str, Any]] = []
         self.is_alone = False
 
     def submit_tasks(self, workers: int | None) -> None:
+        """Submit as many tasks as keep `workers` busy; None: all workers that there are."""
         if self.running and (self.is_alone or self.suspects):
             return
         self.is_alone = bool(self.suspects)
         if self.is_alone:
             self._submit(*self.suspects.pop())
             return
-        workers = max(1, len(self.client.nthreads())) if workers is None else workers
-        room = _QUEUED_PER_WORKER * workers - len(self.running)
-        for key, task in itertools.islice(self.tasks, max(0, room)):
+        if workers is None:
+            workers = max(1, len(self.client.nthreads()))
+        missing = _QUEUED_PER_WORKER * workers - len(self.running)
+        for key, task in itertools.islice(self.tasks, max(0, missing)):
             self._submit(key, task)
 
     def _submit(self, key: str, task: Any) -> None:
-        name = f"vkc-{key}-{secrets.token_hex(4)}"  # clients share results of the same name
+        # Clients share results of the same name.
+        name = f"vkc-{key}-{secrets.token_hex(4)}"
         future = self.client.submit(
             run_with_time_limit, self.function, task, self.limit, key=name, pure=False
         )
@@ -175,8 +189,9 @@ class _ClusterRun:
             if not self.is_alone:
                 self.suspects.append((key, task))
                 return None
-            late = "" if self.limit is None else f", or longer than {self.limit:g} s"
-            reason = f"{MAX_CRASHES} processes died with it: out of memory, a crash{late}"
+            reason = f"{MAX_CRASHES} processes died with it: out of memory, a crash"
+            if self.limit is not None:
+                reason += f", or longer than {self.limit:g} s"
             result = CrashedTask(reason)
         future.release()
         return key, result
@@ -191,12 +206,13 @@ def _open_client(jobs: int, scheduler: str | None) -> Generator[tuple[Any, Any]]
     from distributed import Client, LocalCluster
 
     settings = {
-        "distributed.scheduler.allowed-failures": MAX_CRASHES // 2 - 1,  # twice: once alone
+        # Tasks of a crash are run twice, the second time alone.
+        "distributed.scheduler.allowed-failures": MAX_CRASHES // 2 - 1,
         "distributed.logging.distributed": "error",
         "distributed.worker.multiprocessing-method": "spawn",
-        # the profiler keeps stacks of the last hour, 150 kB per second
+        # The profiler keeps stacks of the last hour, 150 kB per second.
         "distributed.worker.profile.enabled": False,
-        # tasks take seconds; checks at Dask's own intervals, 20 to 500 ms, took 4 % of a core
+        # Tasks take seconds. Checks at Dask's own intervals, 20 to 500 ms, took 4 % of a core.
         "distributed.admin.tick.interval": "1s",
         "distributed.admin.tick.cycle": "10s",
         "distributed.admin.system-monitor.interval": "5s",
@@ -204,7 +220,9 @@ def _open_client(jobs: int, scheduler: str | None) -> Generator[tuple[Any, Any]]
         "distributed.scheduler.active-memory-manager.start": False,
         # Results leave the processes at once, so there is nothing to spill. A paused process, with
         # its caches full, would never resume.
-        **{f"distributed.worker.memory.{key}": False for key in ("target", "spill", "pause")},
+        "distributed.worker.memory.target": False,
+        "distributed.worker.memory.spill": False,
+        "distributed.worker.memory.pause": False,
         "distributed.comm.timeouts.connect": f"{_CONNECT_TIMEOUT:g}s",
     }
     with dask.config.set(settings), contextlib.ExitStack() as stack:
@@ -243,7 +261,7 @@ def _compute_memory_limit(jobs: int) -> int:
 
 def run_with_time_limit(function: Function, task: Any, limit: float | None) -> Any:
     """Return the result of a task; after `limit` [s], SIGALRM ends this process."""
-    # nothing handles the signal, which kills the process even in compiled code
+    # Nothing handles the signal, which kills the process even in compiled code.
     signal.setitimer(signal.ITIMER_REAL, limit or 0.0)
     try:
         return function(task)

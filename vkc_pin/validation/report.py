@@ -101,9 +101,10 @@ class Exemption(StoredRecord):
     reason: Text
 
     def __str__(self) -> str:
-        by = 1e3 * abs(self.distance)
-        close = f"{by:.1f} mm apart" if self.distance >= 0.0 else f"overlap by {by:.1f} mm"
-        return f"{self.subject}: {close}; {self.reason}"
+        millimetres = 1e3 * abs(self.distance)
+        if self.distance >= 0.0:
+            return f"{self.subject}: {millimetres:.1f} mm apart; {self.reason}"
+        return f"{self.subject}: overlap by {millimetres:.1f} mm; {self.reason}"
 
 
 @dataclass(frozen=True)
@@ -163,13 +164,13 @@ class Report(StoredRecord):
         head = f"validation  {self.states} configurations checked: "
         if self.ok:
             return [head + "every constraint holds"]
+        lines = [head + f"{len(self.violations)} constraint(s) violated"]
+        lines += [f"  - {violation}" for violation in self.violations[:MAX_VIOLATIONS]]
         more = len(self.violations) - MAX_VIOLATIONS
-        return [
-            head + f"{len(self.violations)} constraint(s) violated",
-            *(f"  - {v}" for v in self.violations[:MAX_VIOLATIONS]),
-            *([f"  ... and {more} more"] if more > 0 else []),
-            *(f"  because {note}" for note in self.notes),
-        ]
+        if more > 0:
+            lines.append(f"  ... and {more} more")
+        lines += [f"  because {note}" for note in self.notes]
+        return lines
 
     def __str__(self) -> str:
         return "\n".join(self.lines())
@@ -184,24 +185,26 @@ class Report(StoredRecord):
 
     def timing(self) -> list[str]:
         """Return limiting constraints, torques, remarks, exemptions and what else is allowed."""
-        listed = ", ".join(map(str, self.bounds[:MAX_BOUNDS]))
-        torque = f"torques     at most {100.0 * self.torque:.0f} % of the motors' limits"
-        return [
-            *([f"bounded by  {listed}"] if listed else []),
-            *([torque] if self.torque > 0.0 else []),
-            *(f"unknown     {remark}" for remark in self.remarks),
-            *(f"exempt      {exemption}" for exemption in self.exemptions),
-            *(f"allowed     {line}" for line in self.allowed),
-        ]
+        lines = list[str]()
+        if self.bounds:
+            lines.append(f"bounded by  {', '.join(map(str, self.bounds[:MAX_BOUNDS]))}")
+        if self.torque > 0.0:
+            lines.append(f"torques     at most {100.0 * self.torque:.0f} % of the motors' limits")
+        lines += [f"unknown     {remark}" for remark in self.remarks]
+        lines += [f"exempt      {exemption}" for exemption in self.exemptions]
+        lines += [f"allowed     {line}" for line in self.allowed]
+        return lines
 
     def by_phase(self, trajectory: Trajectory) -> list[str]:
         """Return a line of text per phase: time span, base and arm travel, and clearance."""
-        lines, nearest = [], self.clearances or (float("inf"),) * len(trajectory.phases)
-        for part, close in zip(trajectory.parts(), nearest, strict=True):
-            first, last = part.times[0], part.times[-1]
-            effort = part.base_path_length(), part.arm_path_length()
-            travel = f"base {effort[0]:5.2f} m, arm {effort[1]:5.2f} rad, {1e3 * close:6.1f} mm"
-            lines.append(f"{first:6.1f} to {last:6.1f} s: {travel}, {part.phases[0].name}")
+        lines = list[str]()
+        clearances = self.clearances or (float("inf"),) * len(trajectory.phases)
+        for part, clearance in zip(trajectory.parts(), clearances, strict=True):
+            base = part.base_path_length()
+            arm = part.arm_path_length()
+            travel = f"base {base:5.2f} m, arm {arm:5.2f} rad, {1e3 * clearance:6.1f} mm"
+            span = f"{part.times[0]:6.1f} to {part.times[-1]:6.1f} s"
+            lines.append(f"{span}: {travel}, {part.phases[0].name}")
         return lines
 
     def with_reasons(self, reasons: Sequence[Violation]) -> Report:
@@ -215,9 +218,11 @@ class Report(StoredRecord):
             count = len(claimed.violations)
             lines.append(f"{count} constraint(s) violated" if count else "every constraint holds")
         for name, unit in (("clearance", "m"), ("closure_error", "m"), ("closure_angle", "rad")):
-            there, here = getattr(claimed, name), getattr(self, name)
-            if there != here and not abs(there - here) <= AGREEMENT_TOLERANCE:
-                lines.append(f"{name} {there:.6g} {unit} instead of {here:.6g} {unit}")
+            other = getattr(claimed, name)
+            own = getattr(self, name)
+            # Infinite numbers are equal without a difference, and NaN equals nothing.
+            if other != own and not abs(other - own) <= AGREEMENT_TOLERANCE:
+                lines.append(f"{name} {other:.6g} {unit} instead of {own:.6g} {unit}")
         return lines
 
     def to_dict(self) -> dict[str, Any]:

@@ -37,6 +37,7 @@ from vkc_pin.world.files.writing import check_name, write_atomically
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.task.steps import step_from_dict, step_to_dict
 from vkc_pin.world.task.terms import term_from_dict, term_to_dict
+from vkc_pin.world.trajectory.formats.archives import nest_knots
 from vkc_pin.world.trajectory.trajectory import TrajectorySchema
 
 if TYPE_CHECKING:
@@ -44,8 +45,14 @@ if TYPE_CHECKING:
 
 
 _OBSERVED = (
-    *("base_pose", "base_velocity", "arm_position", "arm_velocity"),
-    *("hand_pose", "gripper", "holding", "object_position"),
+    "base_pose",
+    "base_velocity",
+    "arm_position",
+    "arm_velocity",
+    "hand_pose",
+    "gripper",
+    "holding",
+    "object_position",
 )
 _ENVIRONMENT = "vkc_pin"
 _HELD_OUT = 10  # every so many an episode is in mask/valid, the others are in mask/train
@@ -62,6 +69,7 @@ _MOTION = {
 }
 _IMAGES = {"_image": ("u1", 4), "_depth": ("u2", 3), "_segmentation": ("u2", 3)}
 _MAX_IMAGES = 4_000_000_000  # [bytes] of a camera in an episode
+_MIN_COMPRESSED = 512  # [bytes] of an array, up to which it is not compressed
 _TOLERANCE = 1e-5  # of single precision, and of other machines; relative, and [m] or [rad]
 Made = tuple[dict[str, Any], bytes]
 """The record of an attempt, and its episode as packed by `make_part`, empty after a failure."""
@@ -93,8 +101,9 @@ def write_shard(path: Path, parts: Sequence[tuple[Path, int]], scenes: Path) -> 
                 _keep_scene(found, _read_scene_name(demo), scenes)
                 found.handle.copy(f"data/demo_{place}", data, name=name)
                 if k == 0:
-                    for said in ("options", "env_args"):  # of the recipe, and so of all
-                        data.attrs[said] = found.open_group("data").read_text(said)
+                    # They follow from the recipe, and so are the same in all.
+                    for attribute in ("options", "env_args"):
+                        data.attrs[attribute] = found.open_group("data").read_text(attribute)
                 total += demo.read_integer("num_samples")
                 numbers.append(demo.read_integer("number"))
         data.attrs["total"] = total
@@ -116,7 +125,7 @@ def make_part(episode: Episode, robot: Robot, rate: float, recipe: str) -> bytes
     buffer = io.BytesIO()
     with h5py.File(buffer, "w", libver="latest") as file:
         data = file.create_group("data")
-        _write(data.create_group("demo_0"), episode, robot, rate)
+        _write_demo(data.create_group("demo_0"), episode, robot, rate)
         data.attrs["options"] = json.dumps(asdict(episode.options), sort_keys=True)
         data.attrs["env_args"] = json.dumps(_make_settings(robot.name, rate, recipe))
         scene = json.dumps(episode.document, sort_keys=True, separators=(",", ":")) + "\n"
@@ -139,7 +148,8 @@ def _make_masks(numbers: Sequence[int]) -> dict[str, list[str]]:
     """Return the demos for training and validation of a shard with these episodes."""
     masks: dict[str, list[str]] = {"train": [], "valid": []}
     for k, number in enumerate(numbers):
-        masks["valid" if number % _HELD_OUT == _HELD_OUT - 1 else "train"].append(f"demo_{k}")
+        is_held_out = number % _HELD_OUT == _HELD_OUT - 1
+        masks["valid" if is_held_out else "train"].append(f"demo_{k}")
     return masks
 
 
@@ -154,39 +164,42 @@ def _keep_scene(found: Group, name: str, scenes: Path) -> None:
 
 def _make_arrays(episode: Episode, robot: Robot, rate: float) -> dict[str, NDArray[np.generic]]:
     """Return all that is sampled from a motion, by its place in a demo."""
-    found = sample_episode(episode, robot, rate)
-    done = np.zeros(len(found["time"]), np.uint8)
+    samples = sample_episode(episode, robot, rate)
+    done = np.zeros(len(samples["time"]), np.uint8)
     done[-1] = 1
-    arrays = {f"obs/{name}": found[name].astype(np.float32) for name in _OBSERVED}
-    arrays |= {name: found[name].astype(np.float32) for name in ("actions", "states")}
-    return {**arrays, "dones": done, "rewards": done.astype(np.float32)}
+    arrays: dict[str, NDArray[np.generic]] = {}
+    for name in _OBSERVED:
+        arrays[f"obs/{name}"] = samples[name].astype(np.float32)
+    for name in ("actions", "states"):
+        arrays[name] = samples[name].astype(np.float32)
+    arrays["dones"] = done
+    arrays["rewards"] = done.astype(np.float32)
+    return arrays
 
 
-def _write(group: h5py.Group, episode: Episode, robot: Robot, rate: float) -> None:
-    arrays, motion = _make_arrays(episode, robot, rate), episode.trajectory.to_dict()
+def _write_demo(group: h5py.Group, episode: Episode, robot: Robot, rate: float) -> None:
+    """Write an episode: samples, images and motion as arrays, all else as attributes."""
+    arrays = _make_arrays(episode, robot, rate)
     for name, values in arrays.items():
-        _array(group, name, values, values.dtype)
+        _write_array(group, name, values, values.dtype)
     images = episode.images()
-    pictures = {} if images is None else images.pictures
-    for name, pixels in pictures.items():
-        # A chunk for each moment: loaders read single ones.
-        squeezed = {"compression": "gzip", "compression_opts": 4, "shuffle": True}
-        group.create_dataset(f"obs/{name}", data=pixels, chunks=(1, *pixels.shape[1:]), **squeezed)
-    curve = {name: np.array(values) for name, values in motion.pop("curve", {}).items()}
-    waypoints = {name: np.array(motion.pop(name)) for name in ("times", "positions")}
-    at = _among(curve, waypoints)
-    if at is None:
-        for name, values in waypoints.items():
-            _array(group, f"motion/{name}", values, np.float64)
-    else:
-        _array(group, "motion/waypoints", at, np.int32)
-    for name, values in curve.items():
-        _array(group, f"motion/knot_{name}", values, np.float64)
+    if images is not None:
+        for name, pixels in images.pictures.items():
+            group.create_dataset(
+                f"obs/{name}",
+                data=pixels,
+                chunks=(1, *pixels.shape[1:]),  # loaders read single moments
+                compression="gzip",
+                compression_opts=4,
+                shuffle=True,
+            )
+    motion = episode.trajectory.to_dict()
+    _write_motion(group, motion)
     group.attrs["num_samples"] = len(arrays["dones"])
     group.attrs["number"] = episode.number
     group.attrs["scene"] = compute_scene_name(episode.document)
     group.attrs["task"] = str(episode.about["task"])
-    said: dict[str, Any] = {
+    description: dict[str, Any] = {
         "about": dict(episode.about),
         "start": dict(episode.start),
         "where": episode.where,
@@ -195,29 +208,55 @@ def _write(group: h5py.Group, episode: Episode, robot: Robot, rate: float) -> No
         "validation": replace_infinite(episode.claimed.to_dict()),
     }
     if episode.terms:
-        said["terms"] = [term_to_dict(term) for term in episode.terms]
+        description["terms"] = [term_to_dict(term) for term in episode.terms]
     if images is not None:
-        said["images"], said["segments"] = list(images.pictures), images.segments
-    group.attrs["episode"] = json.dumps(said, sort_keys=True)
+        description["images"] = list(images.pictures)
+        description["segments"] = images.segments
+    group.attrs["episode"] = json.dumps(description, sort_keys=True)
 
 
-def _among(curve: Mapping[str, Floats], waypoints: Mapping[str, Floats]) -> Ints | None:
+def _write_motion(group: h5py.Group, motion: dict[str, Any]) -> None:
+    """Write the arrays of a motion to the group `motion`, and remove them from the motion.
+
+    Waypoints that all are knots of the curve are written as indices, which take fewer bytes.
+    """
+    curve = {name: np.array(values) for name, values in motion.pop("curve", {}).items()}
+    waypoints = {name: np.array(motion.pop(name)) for name in ("times", "positions")}
+    at = _find_among_knots(curve, waypoints)
+    if at is None:
+        for name, values in waypoints.items():
+            _write_array(group, f"motion/{name}", values, np.float64)
+    else:
+        _write_array(group, "motion/waypoints", at, np.int32)
+    for name, values in curve.items():
+        _write_array(group, f"motion/knot_{name}", values, np.float64)
+
+
+def _find_among_knots(curve: Mapping[str, Floats], waypoints: Mapping[str, Floats]) -> Ints | None:
     """Return the indices of waypoints among the knots of a curve, shape (T,), if all match."""
     if not curve:
         return None
-    at = np.minimum(np.searchsorted(curve["times"], waypoints["times"]), len(curve["times"]) - 1)
-    same = all(np.array_equal(curve[name][at], waypoints[name]) for name in ("times", "positions"))
-    return at if same else None
+    last = len(curve["times"]) - 1
+    at = np.minimum(np.searchsorted(curve["times"], waypoints["times"]), last)
+    for name in ("times", "positions"):
+        if not np.array_equal(curve[name][at], waypoints[name]):
+            return None
+    return at
 
 
-def _array(group: h5py.Group, name: str, values: Any, kind: Any) -> None:
+def _write_array(group: h5py.Group, name: str, values: Any, kind: Any) -> None:
     values = np.asarray(values, kind)
-    squeezed = (
-        {"compression": "gzip", "compression_opts": 6, "shuffle": True}
-        if values.nbytes > 512
-        else {}
+    if values.nbytes <= _MIN_COMPRESSED:
+        group.create_dataset(name, data=values)
+        return
+    group.create_dataset(
+        name,
+        data=values,
+        chunks=values.shape,
+        compression="gzip",
+        compression_opts=6,
+        shuffle=True,
     )
-    group.create_dataset(name, data=values, chunks=values.shape if squeezed else None, **squeezed)
 
 
 class EpisodeSchema(Schema):
@@ -246,7 +285,9 @@ class Shard:
     """
 
     def __init__(self, root: Group, scenes: Path) -> None:
-        self.file, self._root, self._scenes = root.file, root, scenes
+        self.file = root.file
+        self._root = root
+        self._scenes = scenes
         self._data = root.open_group("data")
         self._documents: dict[str, Any] = {}
 
@@ -310,18 +351,20 @@ class Shard:
         """
         demo = self._data.open_group(f"demo_{k}")
         arrays = _make_arrays(episode, robot, rate)
-        count, found = len(arrays["dones"]), []
+        count = len(arrays["dones"])
+        found = list[str]()
         for name, values in arrays.items():
             stored = demo.read_array(name, values.dtype.str[1:], values.shape)
             wrong = ~np.isclose(stored, values, rtol=_TOLERANCE, atol=_TOLERANCE)
             if wrong.any():
-                row = np.argwhere(wrong)[0].tolist()
-                at = tuple(row)
-                found.append(f"{name}{row} is {stored[at]:.6g}, not {values[at]:.6g} as its motion")
+                place = np.argwhere(wrong)[0].tolist()
+                claim = stored[tuple(place)]
+                truth = values[tuple(place)]
+                found.append(f"{name}{place} is {claim:.6g}, not {truth:.6g} as its motion")
         _check_images(demo, _read_description(demo).images or [], count)
         claims = {"num_samples": demo.read_integer("num_samples"), "task": demo.read_text("task")}
-        truth = {"num_samples": count, "task": episode.about.get("task")}
-        return found + _compare(claims, truth)
+        expected = {"num_samples": count, "task": episode.about.get("task")}
+        return found + _compare(claims, expected)
 
     def find_shard_differences(self, robot: str, recipe: Recipe) -> list[str]:
         """Return what a learner reads of the shard as a whole that does not follow from its demos.
@@ -333,41 +376,40 @@ class Shard:
         self._root.check_names(("data", "mask"))
         demos = [self._data.open_group(f"demo_{k}") for k in range(len(self))]
         numbers = [demo.read_integer("number") for demo in demos]
-        masks, mask = _make_masks(numbers), self._root.open_group("mask")
+        masks = _make_masks(numbers)
+        mask = self._root.open_group("mask")
         mask.check_names(tuple(masks))
         claims: dict[str, Any] = {
             "total": self._data.read_integer("total"),
             "env_args": parse_json(self._data.read_text("env_args"), self.file),
             "options": parse_json(self._data.read_text("options"), self.file),
-            **{
-                f"mask/{name}": [
-                    text.decode(errors="replace")
-                    for text in mask.read_array(name, "S", (None,)).tolist()
-                ]
-                for name in masks
-            },
         }
-        truth = {
+        truth: dict[str, Any] = {
             "total": sum(demo.read_integer("num_samples") for demo in demos),
             "env_args": _make_settings(robot, recipe.fields.rate, recipe.digest),
             "options": asdict(recipe.options),
-            **{f"mask/{name}": names for name, names in masks.items()},
         }
-        order = [] if numbers == sorted(numbers) else ["its episodes are not in order of number"]
-        return _compare(claims, truth) + order
+        for name, names in masks.items():
+            stored = mask.read_array(name, "S", (None,)).tolist()
+            claims[f"mask/{name}"] = [text.decode(errors="replace") for text in stored]
+            truth[f"mask/{name}"] = names
+        found = _compare(claims, truth)
+        if numbers != sorted(numbers):
+            found.append("its episodes are not in order of number")
+        return found
 
 
 def _compare(claims: Mapping[str, Any], truth: Mapping[str, Any]) -> list[str]:
-    return [
-        f"{name} is {format_value(claims[name])}, not {format_value(value)}"
-        for name, value in truth.items()
-        if claims[name] != value
-    ]
+    found = list[str]()
+    for name, value in truth.items():
+        if claims[name] != value:
+            found.append(f"{name} is {format_value(claims[name])}, not {format_value(value)}")
+    return found
 
 
 @contextlib.contextmanager
 def _expect_episode() -> Iterator[None]:
-    """Convert exceptions of steps, terms and options that are none into an `InputError`."""
+    """Convert other exceptions of damaged steps, terms and options to an `InputError`."""
     try:
         yield
     except InputError:
@@ -437,10 +479,10 @@ def _check_members(demo: Group) -> None:
 def _check_images(demo: Group, names: Sequence[str], count: int | None) -> None:
     """Check types and shapes of images; `count` is the number of samples, if known."""
     for name in names:
-        ending = next((end for end in _IMAGES if name.endswith(end)), None)
-        if ending is None:
+        endings = [ending for ending in _IMAGES if name.endswith(ending)]
+        if not endings:
             raise demo.make_error("no images", name, expected=" or ".join(_IMAGES), got=name)
-        dtype, axes = _IMAGES[ending]
+        dtype, axes = _IMAGES[endings[0]]
         shape = (count, None, None, 3)[:axes]
         demo.check_array(f"obs/{name}", dtype, shape, _MAX_IMAGES)
 
@@ -481,15 +523,7 @@ def _read_motion(demo: Group) -> dict[str, Any]:
                 expected = f"indices from 0 to {len(knots) - 1}"
                 raise group.make_error("out of range", "waypoints", expected=expected)
             arrays[name] = knots[at]
-    motion, curve = dict[str, Any](), dict[str, Any]()
-    for name, values in arrays.items():
-        if name.startswith("knot_"):
-            curve[name.removeprefix("knot_")] = values
-        else:
-            motion[name] = values
-    if curve:
-        motion["curve"] = curve
-    return motion
+    return nest_knots(arrays)
 
 
 def _read_images(path: Path, k: int) -> Images:

@@ -44,6 +44,7 @@ _EXPECTED = {
     "tuple_type": "a list",
 }
 _NUMBERS = (float, int)
+_FINITE = (Mapping, Set, bytes, bytearray, np.ndarray)  # iterables that end
 _SIGNS = {
     "greater_than": ">",
     "greater_than_equal": ">=",
@@ -54,7 +55,9 @@ _SIGNS = {
 
 def format_field(path: tuple[Key, ...]) -> str | None:
     """Return the path of a field as users write it, `obstacles[3].size`; None for the whole."""
-    text = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in path)
+    text = ""
+    for key in path:
+        text += f"[{key}]" if isinstance(key, int) else f".{key}"
     return text.removeprefix(".") or None
 
 
@@ -116,10 +119,8 @@ class Document:
                 raise self.make_unknown_name_error(
                     path, error.kind, error.name, error.choices
                 ) from error
-            where = f"{error.field}: " if error.field else ""
-            raise self.make_error(
-                path, where + error.problem, expected=error.expected, got=error.got
-            ) from error
+            problem = f"{error.field}: {error.problem}" if error.field else error.problem
+            raise self.make_error(path, problem, expected=error.expected, got=error.got) from error
 
 
 def read_head(file: str | Path, kind: str, count: int) -> bytes:
@@ -129,7 +130,8 @@ def read_head(file: str | Path, kind: str, count: int) -> bytes:
 
 def read_bytes(file: str | Path, kind: str, largest: int | None = None) -> bytes:
     """Return a file of a `kind` ("YAML", "plan"), up to `largest` or `MAX_FILE_SIZE` bytes."""
-    largest = MAX_FILE_SIZE if largest is None else largest
+    if largest is None:
+        largest = MAX_FILE_SIZE
     data, size = _read_start(file, kind, largest + 1)
     if size > largest:
         raise InputError(
@@ -140,10 +142,12 @@ def read_bytes(file: str | Path, kind: str, largest: int | None = None) -> bytes
 
 def _read_start(file: str | Path, kind: str, count: int) -> tuple[bytes, int]:
     """Return the first bytes of a file, at most `count`, and its size [bytes]."""
-    path, expected = Path(file), f"an existing {kind} file"
+    path = Path(file)
+    expected = f"an existing {kind} file"
     try:
         is_special = path.exists() and not path.is_file() and not path.is_dir()
-        if is_special:  # reading a pipe would wait for ever
+        # Reading a pipe would wait for ever.
+        if is_special:
             raise InputError(
                 f"cannot read the {kind}", file=file, expected=expected, got="a pipe or a device"
             )
@@ -152,7 +156,7 @@ def _read_start(file: str | Path, kind: str, count: int) -> tuple[bytes, int]:
             return data, max(len(data), os.fstat(stream.fileno()).st_size)
     except InputError:
         raise
-    except (OSError, ValueError) as error:  # the latter: a NUL in the name
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         got = getattr(error, "strerror", None) or error
         raise InputError(
             f"cannot read the {kind}", file=file, expected=expected, got=got
@@ -182,24 +186,32 @@ def parse_json(text: str, file: str | Path) -> Any:
         data = json.loads(text)
     except json.JSONDecodeError as error:
         raise InputError("not JSON", file=file, line=error.lineno, got=error.msg) from None
-    except (RecursionError, ValueError) as error:  # the latter: a number of thousands of digits
+    except (RecursionError, ValueError) as error:  # ValueError: thousands of digits in a number
         raise InputError("not JSON", file=file, got=error) from None
-    level, depth = [data], 0
-    while level := [item for item in level if isinstance(item, dict | list)]:
-        depth += 1
-        if depth > MAX_DEPTH:
-            raise InputError(
-                "too many lists and objects inside each other",
-                file=file,
-                expected=f"at most {MAX_DEPTH}",
-            )
-        level = [
-            inner for item in level for inner in (item.values() if isinstance(item, dict) else item)
-        ]
+    if _exceeds_depth(data):
+        raise InputError(
+            "too many lists and objects inside each other",
+            file=file,
+            expected=f"at most {MAX_DEPTH}",
+        )
     return data
 
 
-# The first is ten times as fast, and not everywhere.
+def _exceeds_depth(data: Any) -> bool:
+    """Return whether there are more than `MAX_DEPTH` lists and objects inside each other."""
+    level = [data]
+    for _ in range(MAX_DEPTH):
+        inner: list[Any] = []
+        for item in level:
+            if isinstance(item, dict):
+                inner += item.values()
+            elif isinstance(item, list):
+                inner += item
+        level = [item for item in inner if isinstance(item, dict | list)]
+    return bool(level)
+
+
+# The loader in C is ten times as fast, and not everywhere.
 _FastLoader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
@@ -231,10 +243,9 @@ def read_yaml(file: str | Path) -> Document:
         data = None if node is None else loader.construct_document(node)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
+        line = mark.line + 1 if mark else None
         problem = "; ".join(part for part in (error.context, error.problem) if part)
-        raise InputError(
-            f"not valid YAML: {problem}", file=path, line=mark.line + 1 if mark else None
-        ) from error
+        raise InputError(f"not valid YAML: {problem}", file=path, line=line) from error
     except InputError:
         raise
     except (yaml.YAMLError, RecursionError, ValueError, TypeError) as error:
@@ -273,33 +284,32 @@ def _check_plain(document: Document) -> None:
             )
         if isinstance(value, dict):
             left += [(path, name) for name in value if isinstance(name, str)]
-            left += [
-                ((*path, name if isinstance(name, int | str) else format_value(name)), entry)
-                for name, entry in value.items()
-            ]
+            for name, entry in value.items():
+                key = name if isinstance(name, int | str) else format_value(name)
+                left.append(((*path, key), entry))
         elif isinstance(value, list | tuple):
-            # Motions have lists of 100 000 numbers.
-            left += [
-                ((*path, place), entry)
-                for place, entry in enumerate(value)
-                if not isinstance(entry, _NUMBERS)
-            ]
+            for place, entry in enumerate(value):
+                # Motions have lists of 100 000 numbers.
+                if not isinstance(entry, _NUMBERS):
+                    left.append(((*path, place), entry))
         elif isinstance(value, str):
-            try:
-                value.encode("utf-8")
-            except UnicodeEncodeError:
-                raise document.make_error(
-                    path, "not text", expected="text in UTF-8", got=ascii(value)
-                ) from None
-        elif isinstance(value, Iterable) and not isinstance(
-            value, Mapping | Set | bytes | bytearray | np.ndarray
-        ):
+            _check_encodable(document, path, value)
+        elif isinstance(value, Iterable) and not isinstance(value, _FINITE):
             raise document.make_error(
                 path,
                 "wrong type of value",
                 expected="a list, fields, text or a number",
                 got=format_value(value),
             )
+
+
+def _check_encodable(document: Document, path: tuple[Key, ...], text: str) -> None:
+    try:
+        text.encode("utf-8")
+    except UnicodeEncodeError:
+        raise document.make_error(
+            path, "not text", expected="text in UTF-8", got=ascii(text)
+        ) from None
 
 
 def _check_depth(events: Iterable[yaml.Event], file: Path) -> None:
@@ -310,12 +320,8 @@ def _check_depth(events: Iterable[yaml.Event], file: Path) -> None:
             depth += 1
             if depth > MAX_DEPTH:
                 line = event.start_mark.line + 1 if event.start_mark else None
-                raise InputError(
-                    "too many lists inside each other",
-                    file=file,
-                    line=line,
-                    expected=f"at most {MAX_DEPTH}",
-                )
+                problem, expected = "too many lists inside each other", f"at most {MAX_DEPTH}"
+                raise InputError(problem, file=file, line=line, expected=expected)
         elif isinstance(event, yaml.CollectionEndEvent):
             depth -= 1
 
@@ -328,36 +334,30 @@ def _record_lines(
     above: set[int],
 ) -> None:
     """Add the lines of `node` and its descendants; `above` has the ids of its parents."""
-    lines.setdefault(path, node.start_mark.line + 1)
+    line = node.start_mark.line + 1
+    lines.setdefault(path, line)
     if len(lines) > MAX_FIELDS:  # a few lines of aliases of aliases make any number
-        raise InputError(
-            "too many fields",
-            file=file,
-            line=node.start_mark.line + 1,
-            expected=f"at most {MAX_FIELDS}",
-        )
+        raise InputError("too many fields", file=file, line=line, expected=f"at most {MAX_FIELDS}")
     if id(node) in above:
-        raise InputError(
-            "an alias contains itself",
-            file=file,
-            line=node.start_mark.line + 1,
-            field=format_field(path),
-        )
+        raise InputError("an alias contains itself", file=file, line=line, field=format_field(path))
     above = above | {id(node)}
     if isinstance(node, yaml.MappingNode):
         seen: dict[str, int] = {}
         for key, value in node.value:
             name = key.value if isinstance(key, yaml.ScalarNode) else str(key.value)
+            inner = (*path, name)
             line = key.start_mark.line + 1
             if name in seen:
-                lines_of = f"lines {seen[name]} and {line}"
-                problem = "this field stands here twice"
                 raise InputError(
-                    problem, file=file, line=line, field=format_field((*path, name)), got=lines_of
+                    "this field stands here twice",
+                    file=file,
+                    line=line,
+                    field=format_field(inner),
+                    got=f"lines {seen[name]} and {line}",
                 )
             seen[name] = line
-            lines[(*path, name)] = line
-            _record_lines(value, (*path, name), lines, file, above)
+            lines[inner] = line
+            _record_lines(value, inner, lines, file, above)
     elif isinstance(node, yaml.SequenceNode):
         for index, item in enumerate(node.value):
             _record_lines(item, (*path, index), lines, file, above)
@@ -365,52 +365,53 @@ def _record_lines(
 
 def _find_error_path(data: Any, error: Any) -> tuple[Key, ...]:
     """Return the path of pydantic's error in the data, without the tags of unions."""
-    path: list[Key] = []
+    kind = error["type"]
     location = error["loc"]
+    path: list[Key] = []
     for position, key in enumerate(location):
-        listed = isinstance(data, list | tuple) and isinstance(key, int) and key < len(data)
-        if listed or (isinstance(data, dict) and key in data):
+        is_entry = isinstance(data, list | tuple) and isinstance(key, int) and key < len(data)
+        if is_entry or (isinstance(data, dict) and key in data):
             path.append(key)
             data = data[key]
-        elif position == len(location) - 1 and error["type"] == "missing":
+        elif kind == "missing" and position == len(location) - 1:
             path.append(key)
-    if error["type"] in ("unknown_field", "missing_field"):
+    if kind in ("unknown_field", "missing_field"):
         path.append(error["ctx"]["name"])
-    elif error["type"] in ("union_tag_invalid", "union_tag_not_found"):
+    elif kind in ("union_tag_invalid", "union_tag_not_found"):
         path.append(error["ctx"]["discriminator"].strip("'"))
     return tuple(path)
 
 
 def _translate_error(document: Document, path: tuple[Key, ...], error: Any) -> InputError:
-    kind, context, got = error["type"], error.get("ctx", {}), error["input"]
+    """Return pydantic's error as one that names line and field."""
+    kind = error["type"]
+    context = error.get("ctx", {})
+    value = error["input"]
     if kind == "unknown_field":
         return document.make_unknown_name_error(path, "field", context["name"], context["choices"])
-    if kind in ("missing", "missing_field", "union_tag_not_found"):
-        tag = kind == "union_tag_not_found"
-        return document.make_error(
-            path, "missing", expected="the object's kind" if tag else "a value", got="nothing"
-        )
     if kind in ("union_tag_invalid", "literal_error"):
-        choices = re.findall(
-            r"'([^']*)'", context["expected_tags" if kind == "union_tag_invalid" else "expected"]
-        )
-        return document.make_unknown_name_error(
-            path, str(path[-1]), context.get("tag", got), choices
-        )
+        listed = context["expected_tags" if kind == "union_tag_invalid" else "expected"]
+        choices = re.findall(r"'([^']*)'", listed)
+        name = context.get("tag", value)
+        return document.make_unknown_name_error(path, str(path[-1]), name, choices)
+    problem, expected, got = _describe_error(kind, context, value, error["msg"])
+    return document.make_error(path, problem, expected=expected, got=got)
+
+
+def _describe_error(
+    kind: str, context: Mapping[str, Any], value: Any, message: str
+) -> tuple[str, object, object]:
+    """Return the problem of a value, what was expected, and what came."""
+    got = format_value(value)
+    if kind in ("missing", "missing_field"):
+        return "missing", "a value", "nothing"
+    if kind == "union_tag_not_found":
+        return "missing", "the object's kind", "nothing"
     if kind == "too_long":
-        return document.make_error(
-            path,
-            "too many",
-            expected=f"at most {context['max_length']}",
-            got=context["actual_length"],
-        )
+        return "too many", f"at most {context['max_length']}", context["actual_length"]
     if kind == "vkc":
-        return document.make_error(
-            path, context["problem"], expected=context["expected"], got=format_value(got)
-        )
+        return context["problem"], context["expected"], got
     if kind in _SIGNS:
-        problem = "out of range"
-        expected = f"a number {_SIGNS[kind]} {next(iter(context.values())):g}"
-    else:
-        problem, expected = "wrong value", _EXPECTED.get(kind, error["msg"])
-    return document.make_error(path, problem, expected=expected, got=format_value(got))
+        (limit,) = context.values()
+        return "out of range", f"a number {_SIGNS[kind]} {limit:g}", got
+    return "wrong value", _EXPECTED.get(kind, message), got

@@ -7,6 +7,7 @@ import itertools
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import coal
 import numpy as np
@@ -48,8 +49,9 @@ def apply_deviation(attachment: Attachment, deviation: Sequence[float]) -> Attac
     """Return an attachment with a deviation, see `Hold.deviation`; none if it is empty."""
     if not deviation:
         return attachment
-    turn, shift = pin.exp3(np.array(deviation[3:])), np.array(deviation[:3])
-    return dataclasses.replace(attachment, deviation=pin.SE3(turn, shift))
+    translation = np.array(deviation[:3])
+    rotation = pin.exp3(np.array(deviation[3:]))
+    return dataclasses.replace(attachment, deviation=pin.SE3(rotation, translation))
 
 
 def fit_grasp(
@@ -83,6 +85,9 @@ def measure_deviation(
 ) -> tuple[tuple[float, ...], Floats]:
     """Return the freedoms of a grasp, and how far the hand is from the attachment.
 
+    With the placement M of the hand in the attachment's frame, the deviation at the values v is
+    (J(v) · offset)⁻¹ · M, see `Attachment`, as translation and rotation vector.
+
     Args:
         attachment: The attachment.
         measured: Measured placement of its frame in the grasping frame.
@@ -95,8 +100,8 @@ def measure_deviation(
     hand = measured.inverse()
 
     def compute_deviation(at: Sequence[float] | Floats) -> Floats:
-        off = attachment.motion(at).actInv(hand)
-        return np.concatenate([off.translation, pin.log3(off.rotation)])
+        difference = attachment.motion(at).actInv(hand)
+        return np.concatenate([difference.translation, pin.log3(difference.rotation)])
 
     if values is None:
         values = _fit_freedoms(attachment, compute_deviation)
@@ -105,7 +110,8 @@ def measure_deviation(
 
 def compute_distances(deviation: Sequence[float] | Floats) -> tuple[float, float]:
     """Return distance [m] and angle [rad] of a hand from its attachment; see `Hold.deviation`."""
-    position, angle = (float(np.linalg.norm(part)) for part in (deviation[:3], deviation[3:]))
+    position = float(np.linalg.norm(deviation[:3]))
+    angle = float(np.linalg.norm(deviation[3:]))
     return position, angle
 
 
@@ -137,8 +143,9 @@ def _fit_freedoms(
 
     scale = np.repeat([MAX_POSITION_DEVIATION, MAX_ANGLE_DEVIATION], 3)
     lower, upper = np.array([(one.lower, one.upper) for one in attachment.freedoms]).T
-    starts = itertools.product(*zip(lower, (lower + upper) / 2.0, upper, strict=True))
-    fits = (
+    middle = (lower + upper) / 2.0
+    starts = itertools.product(*zip(lower, middle, upper, strict=True))
+    fits = [
         least_squares(
             lambda at: compute_deviation(at) / scale,
             np.clip(start, lower, upper),
@@ -148,8 +155,9 @@ def _fit_freedoms(
             gtol=1e-12,
         )
         for start in itertools.islice(starts, _MAX_STARTS)
-    )
-    return tuple(min(fits, key=lambda fit: float(fit.cost)).x.tolist())
+    ]
+    best = min(fits, key=lambda fit: float(fit.cost))
+    return tuple(best.x.tolist())
 
 
 @dataclass(frozen=True)
@@ -178,21 +186,20 @@ class Hold:
     deviation: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("object", "attachment", "link"):
-            if name != "link" or self.link is not None:
-                check_text(getattr(self, name), f"Hold.{name}", "a name")
+        check_text(self.object, "Hold.object", "a name")
+        check_text(self.attachment, "Hold.attachment", "a name")
+        if self.link is not None:
+            check_text(self.link, "Hold.link", "a name")
         if self.by is not None:
             check_instance(self.by, Hold, "Hold.by")
-        object.__setattr__(
-            self, "at", tuple(check_array(self.at, "Hold.at", "a list of numbers").ravel().tolist())
-        )
+        values = check_array(self.at, "Hold.at", "a list of numbers").ravel()
+        object.__setattr__(self, "at", tuple(values.tolist()))
         deviation = check_finite_array(self.deviation, "Hold.deviation").ravel()
         if deviation.size not in (0, 6):
-            expected = "x, y, z [m] and a rotation vector [rad]"
             raise InputError(
                 "wrong number of values",
                 field="Hold.deviation",
-                expected=expected,
+                expected="x, y, z [m] and a rotation vector [rad]",
                 got=deviation.size,
             )
         check_deviation(deviation, "Hold.deviation")
@@ -211,7 +218,8 @@ class Hold:
         return Hold(self.object, self.attachment, by, self.link)
 
     def __str__(self) -> str:
-        return f"{self.object}.{self.attachment}" + (f" by {self.frame}" if self.by else "")
+        text = f"{self.object}.{self.attachment}"
+        return f"{text} by {self.frame}" if self.by else text
 
 
 class Holds(tuple[Hold, ...]):
@@ -240,10 +248,9 @@ def make_holds(
         deviation: Object → deviation of its grasp, see `Hold`.
     """
     held = check_mapping(held, "held", "object names, each with that of an attachment")
-    by, at, deviation = (
-        check_mapping({} if given is None else given, field_name)
-        for field_name, given in (("by", by), ("at", at), ("deviation", deviation))
-    )
+    by = check_mapping({} if by is None else by, "by")
+    at = check_mapping({} if at is None else at, "at")
+    deviation = check_mapping({} if deviation is None else deviation, "deviation")
     if len(held) > MAX_HELD:
         raise InputError(
             "too many objects are held", field="held", expected=f"at most {MAX_HELD}", got=len(held)
@@ -254,42 +261,54 @@ def make_holds(
                 raise UnknownNameError("held object", name, held, field=field_name)
     found: dict[str, Hold] = {}
 
-    def find(name: str, above: tuple[str, ...]) -> Hold:
+    def add(name: str, above: tuple[str, ...]) -> Hold:
+        """Add the hold of an object after those it depends on; `above` depend on it."""
         if name in above:
             raise InputError(
                 "objects hold each other in a cycle", field="by", got=", ".join(sorted(above))
             )
         if name not in found:
-            holder, link = None, None
+            holder = None
+            link = None
             if name in by:
-                expected = "<object>.<link>, e.g. stick.tip"
-                owner, _, link = (
-                    by[name].partition(".") if isinstance(by[name], str) else ("", "", "")
-                )
-                if not link:
-                    raise InputError(
-                        "not a link of an object",
-                        field="by",
-                        expected=expected,
-                        got=format_value(by[name]),
-                    )
+                owner, link = _split_frame(by[name])
                 if owner not in held:
                     raise UnknownNameError("held object", owner, held, field="by")
-                holder = find(owner, (*above, name))
-            details = at.get(name, ()), deviation.get(name, ())
-            found[name] = Hold(name, held[name], holder, link, *details)
+                holder = add(owner, (*above, name))
+            found[name] = Hold(
+                name,
+                held[name],
+                by=holder,
+                link=link,
+                at=at.get(name, ()),
+                deviation=deviation.get(name, ()),
+            )
         return found[name]
 
     for name in held:
-        find(name, ())
+        add(name, ())
     return tuple(found.values())
+
+
+def _split_frame(frame: Any) -> tuple[str, str]:
+    """Return object and link of a label "<object>.<link>"."""
+    owner, _, link = frame.partition(".") if isinstance(frame, str) else ("", "", "")
+    if not link:
+        raise InputError(
+            "not a link of an object",
+            field="by",
+            expected="<object>.<link>, e.g. stick.tip",
+            got=format_value(frame),
+        )
+    return owner, link
 
 
 def check_hold_order(holds: Iterable[Hold]) -> Holds:
     """Return the holds if each comes after the one it depends on."""
     holds = check_list(holds, "holds", "a list of Hold", Hold)
     for number, hold in enumerate(holds):
-        if hold.by not in (None, *holds[:number]):
+        before = holds[:number]
+        if hold.by is not None and hold.by not in before:
             raise InputError(
                 "it is held through an object that is not held before it",
                 field="holds",
@@ -315,8 +334,17 @@ def measure_grasp(
 ) -> pin.SE3:
     """Return where an attachment's frame is in the grasping frame, as the objects are placed."""
     grasp = objects[hold.object].object.attachment(hold.attachment)
-    holder = objects[hold.by.object].link_placement(str(hold.link)) if hold.by else tool()
-    return holder.actInv(objects[hold.object].link_placement(grasp.link) * grasp.placement)
+    hand = _place_grasping_frame(objects, hold, tool)
+    return hand.actInv(objects[hold.object].link_placement(grasp.link) * grasp.placement)
+
+
+def _place_grasping_frame(
+    objects: Mapping[str, PlacedObject], hold: Hold, tool: Callable[[], pin.SE3]
+) -> pin.SE3:
+    """Return the placement of a hold's grasping frame: the tool frame, or a link of an object."""
+    if hold.by is None:
+        return tool()
+    return objects[hold.by.object].link_placement(str(hold.link))
 
 
 def resolve_holds(
@@ -338,8 +366,10 @@ def resolve_holds(
         if hold.object not in objects:
             raise UnknownNameError("object", hold.object, objects, field="held")
         attachment = objects[hold.object].object.attachment(hold.attachment)
-        where, freedoms = f"held.{hold.object}.at", attachment.freedoms
-        values, deviation = hold.at or (0.0,) * len(freedoms), hold.deviation
+        freedoms = attachment.freedoms
+        where = f"held.{hold.object}.at"
+        values = hold.at or (0.0,) * len(freedoms)
+        deviation = hold.deviation
         if len(values) != len(freedoms):
             raise InputError(
                 "wrong number of values",
@@ -364,8 +394,9 @@ def resolve_holds(
                 got=attachment.name,
             )
         if hold.by is not None:
-            objects[hold.by.object].link_placement(str(hold.link))
-            if not (objects[hold.object].object.free and objects[hold.by.object].object.free):
+            holder = objects[hold.by.object]
+            holder.link_placement(str(hold.link))  # raises an error if there is no such link
+            if not (objects[hold.object].object.free and holder.object.free):
                 problem = (
                     "only a free object can be held through another, and only through a free one"
                 )
@@ -381,12 +412,13 @@ def place_held_objects(
     """Return the objects with every free held object at its placement in the hand."""
     placed = dict(objects)
     for hold in holds:
-        one = placed[hold.object]
-        if one.object.free:
-            grasp = get_attachment(objects, hold)
-            in_object = one.object.link_placement(grasp.link, one.state) * grasp.tool(hold.at)
-            holder = placed[hold.by.object].link_placement(str(hold.link)) if hold.by else tool()
-            placed[hold.object] = dataclasses.replace(one, placement=holder * in_object.inverse())
+        item = placed[hold.object]
+        if not item.object.free:
+            continue
+        grasp = get_attachment(objects, hold)
+        in_object = item.object.link_placement(grasp.link, item.state) * grasp.tool(hold.at)
+        hand = _place_grasping_frame(placed, hold, tool)
+        placed[hold.object] = dataclasses.replace(item, placement=hand * in_object.inverse())
     return freeze(placed)
 
 
@@ -394,7 +426,8 @@ def find_reversed_approaches(
     objects: Mapping[str, PlacedObject], holds: Iterable[Hold], robot: Robot, floor: Solids
 ) -> list[Hold]:
     """Return the holds whose approach overlaps the object or the floor, unless reversed."""
-    found, hands = list[Hold](), dict[float | None, Solids]()
+    found = list[Hold]()
+    hands = dict[float | None, Solids]()  # by opening
     for hold in holds:
         placed = objects[hold.object]
         opening = robot.opening(placed.object.attachment(hold.attachment).opening)
@@ -404,16 +437,15 @@ def find_reversed_approaches(
         if hold.by is not None and hold.link is not None:
             holder = objects[hold.by.object]
             back = holder.link_placement(hold.link).inverse()
-            hand = [
-                (shape, back * where)
-                for shape, where in list_placed_shapes(make_world_shapes(holder))
-            ]
+            shapes = list_placed_shapes(make_world_shapes(holder))
+            hand = [(shape, back * where) for shape, where in shapes]
         solids = [*list_placed_shapes(make_world_shapes(placed)), *floor]
-        if hold.attachment in placed.reversed or _is_approach_free(
-            placed, hold.attachment, hand, solids
-        ):
+        if hold.attachment in placed.reversed:
             continue
-        if _is_approach_free(placed.with_reversed(hold.attachment), hold.attachment, hand, solids):
+        if _is_approach_free(placed, hold.attachment, hand, solids):
+            continue
+        turned = placed.with_reversed(hold.attachment)
+        if _is_approach_free(turned, hold.attachment, hand, solids):
             found.append(hold)
     return found
 
@@ -424,28 +456,25 @@ def warn_of_openings(
     """Warn of openings out of the gripper's range, which are clamped to it."""
     requested = {} if start is None else {"the start": start}
     for name, placed in objects.items():
-        own = placed.object.attachments.values()
-        requested |= {f"{name}.{one.name}": one.opening for one in own if one.opening is not None}
-    openings = ", ".join(f"{what} {1e3 * opening:g} mm" for what, opening in requested.items())
-    if robot.gripper is None and requested:
-        hint = "it keeps its rest configuration; describe `gripper` in its robot.yaml"
-        warnings.warn(
-            f"{where}: the gripper of '{robot.name}' cannot open as requested ({openings}): {hint}",
-            stacklevel=4,
-        )
-    elif robot.gripper is not None:
-        least, most = robot.gripper.min_opening, robot.gripper.max_opening
-        beyond = {
-            what: opening
-            for what, opening in requested.items()
-            if abs(robot.gripper.clamp_opening(opening) - opening) > _ROUNDING
-        }
-        for what, opening in beyond.items():
-            can = f"{1e3 * least:.1f} to {1e3 * most:.1f} mm"
-            nearest = 1e3 * robot.gripper.clamp_opening(opening)
-            text = f"the gripper of '{robot.name}' opens from {can}"
-            text += f", not {1e3 * opening:g} mm as requested for {what}"
-            warnings.warn(f"{where}: {text}: it opens to {nearest:.1f} mm", stacklevel=4)
+        for attachment in placed.object.attachments.values():
+            if attachment.opening is not None:
+                requested[f"{name}.{attachment.name}"] = attachment.opening
+    gripper = robot.gripper
+    if gripper is None:
+        if requested:
+            openings = ", ".join(f"{what} {1e3 * size:g} mm" for what, size in requested.items())
+            text = f"the gripper of '{robot.name}' cannot open as requested ({openings})"
+            hint = "it keeps its rest configuration; describe `gripper` in its robot.yaml"
+            warnings.warn(f"{where}: {text}: {hint}", stacklevel=4)
+        return
+    for what, opening in requested.items():
+        nearest = gripper.clamp_opening(opening)
+        if abs(nearest - opening) <= _ROUNDING:
+            continue
+        text = f"the gripper of '{robot.name}' opens from {1e3 * gripper.min_opening:.1f} to "
+        text += f"{1e3 * gripper.max_opening:.1f} mm, not {1e3 * opening:g} mm as requested for "
+        text += f"{what}: it opens to {1e3 * nearest:.1f} mm"
+        warnings.warn(f"{where}: {text}", stacklevel=4)
 
 
 def _is_approach_free(placed: PlacedObject, attachment: str, hand: Solids, solids: Solids) -> bool:
@@ -455,29 +484,28 @@ def _is_approach_free(placed: PlacedObject, attachment: str, hand: Solids, solid
     """
     grasp = placed.object.attachment(attachment)
     where = placed.link_placement(grasp.link)
-    for values in itertools.product(
-        *({freedom.lower, 0.0, freedom.upper} for freedom in grasp.freedoms)
-    ):
+    choices = [{freedom.lower, 0.0, freedom.upper} for freedom in grasp.freedoms]
+    for values in itertools.product(*choices):
         tool = where * grasp.tool(values)
-        approach = [tool * pin.SE3(np.eye(3), np.array([0.0, 0.0, -back])) for back in _APPROACH]
-        if (
-            compute_clearance(
-                [(shape, at * local) for at in approach for shape, local in hand],
-                solids,
-                reach=-_MAX_OVERLAP,
-            )
-            >= -_MAX_OVERLAP
-        ):
+        swept = list[tuple[coal.CollisionGeometry, pin.SE3]]()
+        for back in _APPROACH:
+            at = tool * pin.SE3(np.eye(3), np.array([0.0, 0.0, -back]))
+            swept += [(shape, at * local) for shape, local in hand]
+        if compute_clearance(swept, solids, reach=-_MAX_OVERLAP) >= -_MAX_OVERLAP:
             return True
     return False
 
 
 def _find_hand_shapes(robot: Robot) -> Solids:
     """Return the shapes of a robot's touch links in its tool frame, with all joints at home."""
-    data, shapes = robot.model.createData(), robot.collision.createData()
+    data = robot.model.createData()
+    shapes = robot.collision.createData()
     q = robot.coordinates.q(np.concatenate([np.zeros(3), robot.home]))
     pin.updateGeometryPlacements(robot.model, data, robot.collision, shapes, q)
     pin.updateFramePlacements(robot.model, data)
     back = data.oMf[robot.model.getFrameId(robot.tool_frame)].inverse()
-    own = [i for i in range(len(shapes.oMg)) if robot.link_of(i) in robot.touch_links]
-    return [(robot.collision.geometryObjects[i].geometry, back * shapes.oMg[i]) for i in own]
+    found = list[tuple[coal.CollisionGeometry, pin.SE3]]()
+    for index, item in enumerate(robot.collision.geometryObjects):
+        if robot.link_of(index) in robot.touch_links:
+            found.append((item.geometry, back * shapes.oMg[index]))
+    return found

@@ -106,8 +106,8 @@ class Phase:
     @property
     def name(self) -> str:
         """Name for users, e.g. "reach door.handle", "turn door.knob" or "go to"."""
-        about = ", ".join(map(str, self.grasps) if self.kind == "grasp" else self.about)
-        return f"{_VERBS[self.kind]} {about}".rstrip()
+        subjects = map(str, self.grasps) if self.kind == "grasp" else self.about
+        return f"{_VERBS[self.kind]} {', '.join(subjects)}".rstrip()
 
     @property
     def key(self) -> PhaseKey:
@@ -177,37 +177,36 @@ class Task:
     @property
     def supported(self) -> tuple[SupportedObject, ...]:
         """Objects that rest on moving links in any phase."""
-        return tuple(dict.fromkeys(one for phase in self.phases for one in phase.supported))
+        found = dict[SupportedObject, None]()
+        for phase in self.phases:
+            found |= dict.fromkeys(phase.supported)
+        return tuple(found)
 
     def refine(self, numbers: Collection[int]) -> Task:
         """Return the task with twice as many segments in the phases of some numbers, from 0."""
-        phases = (
-            replace(phase, segments=2 * phase.segments) if number in numbers else phase
-            for number, phase in enumerate(self.phases)
-        )
+        phases = list[Phase]()
+        for number, phase in enumerate(self.phases):
+            segments = 2 * phase.segments if number in numbers else phase.segments
+            phases.append(replace(phase, segments=segments))
         return replace(self, phases=tuple(phases))
 
     def truncate(self, count: int) -> Task:
         """Return the task of the first `count` steps (at least 1) alone."""
         boundary = self.boundaries[count - 1]
         state = dict(islice(self.state.items(), boundary.state))
-        phases = (
-            replace(
-                phase,
-                initial_values={
-                    name: value for name, value in phase.initial_values.items() if name in state
-                },
-            )
-            for phase in self.phases[: boundary.phases]
-        )
+        phases = list[Phase]()
+        for phase in self.phases[: boundary.phases]:
+            values = phase.initial_values
+            known = {name: value for name, value in values.items() if name in state}
+            phases.append(replace(phase, initial_values=known))
         return Task(
-            self.steps[:count],
-            tuple(phases),
-            self.holds[: boundary.holds],
-            state,
-            boundary.after,
-            self.boundaries[:count],
-            tuple(one for one in self.open_attachments if one.step < count),
+            steps=self.steps[:count],
+            phases=tuple(phases),
+            holds=self.holds[: boundary.holds],
+            state=state,
+            after=boundary.after,
+            boundaries=self.boundaries[:count],
+            open_attachments=tuple(one for one in self.open_attachments if one.step < count),
         )
 
 

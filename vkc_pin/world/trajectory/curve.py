@@ -15,8 +15,9 @@ from vkc_pin.utils.arrays import Floats, Ints
 
 MIN_INTERVAL = 1e-9
 """Shortest time between knots [s]."""
-_OFF = 1e-9  # accepted distance of the curve from a waypoint [m] or [rad]
-_LARGEST = 1e12  # largest position [m], [rad] and velocity [m/s], [rad/s]
+_MAX_DISTANCE = 1e-9  # accepted distance of the curve from a waypoint [m] or [rad]
+_MAX_VALUE = 1e12  # largest position [m], [rad] and velocity [m/s], [rad/s]
+_MIN_BEND = 1e-12  # [m/s] or [rad/s] of a velocity, below which it is linear in time
 
 
 @dataclass(frozen=True)
@@ -41,10 +42,9 @@ class Curve:
     rates: Floats
 
     def __post_init__(self) -> None:
-        times, positions, rates = (
-            check_array(getattr(self, name), f"curve.{name}")
-            for name in ("times", "positions", "rates")
-        )
+        times = check_array(self.times, "curve.times")
+        positions = check_array(self.positions, "curve.positions")
+        rates = check_array(self.rates, "curve.rates")
         if times.ndim != 1 or len(times) < 2 or not np.all(np.diff(times) >= MIN_INTERVAL):
             expected = f"at least 2 numbers, each {MIN_INTERVAL:g} s after the one before or more"
             raise InputError("times do not increase", field="curve.times", expected=expected)
@@ -58,9 +58,9 @@ class Curve:
                 "wrong shape", field="curve.rates", expected=positions.shape, got=rates.shape
             )
         for name, array in (("times", times), ("positions", positions), ("rates", rates)):
-            if not np.abs(array).max(initial=0.0) <= _LARGEST:
+            if not np.abs(array).max(initial=0.0) <= _MAX_VALUE:
                 raise InputError(
-                    "out of range", field=f"curve.{name}", expected=f"numbers up to {_LARGEST:g}"
+                    "out of range", field=f"curve.{name}", expected=f"numbers up to {_MAX_VALUE:g}"
                 )
             array = np.array(array, float)
             array.setflags(write=False)
@@ -79,65 +79,85 @@ class Curve:
         return self._cubic(time, 2)
 
     def _cubic(self, time: ArrayLike, derivative: int) -> Floats:
+        """Return positions, or their first or second derivative, at times of shape (...,).
+
+        At the fraction s of the duration h of a cubic with the control points p, c, d, q, and with
+        r = 1 - s, the derivatives by time are
+
+            3/h (r² (c - p) + 2 s r (d - c) + s² (q - d))
+            6/h² (r (p - 2 c + d) + s (c - 2 d + q))
+        """
         moments = np.asarray(time, float)
         k = np.clip(np.searchsorted(self.times, moments, side="right") - 1, 0, len(self.times) - 2)
         h = np.diff(self.times)[k]
         s = (np.clip((moments - self.times[k]) / h, 0.0, 1.0))[..., None]
-        h, p, c, d, q = (
-            array[..., None] if array.ndim == k.ndim else array for array in (h, *self._control(k))
-        )
+        h = h[..., None]
+        p, c, d, q = self._control(k)
         if derivative == 0:
             return _bernstein(s, p, c, d, q)
-        inside = ((moments >= self.times[0]) & (moments <= self.times[-1]))[..., None]
+        r = 1.0 - s
         if derivative == 1:
-            r = 1.0 - s
-            return np.asarray(
-                np.where(
-                    inside, 3.0 / h * (r**2 * (c - p) + 2.0 * s * r * (d - c) + s**2 * (q - d)), 0.0
-                )
-            )
-        return np.asarray(
-            np.where(
-                inside, 6.0 / h**2 * ((1.0 - s) * (p - 2.0 * c + d) + s * (c - 2.0 * d + q)), 0.0
-            )
-        )
+            values = 3.0 / h * (r**2 * (c - p) + 2.0 * s * r * (d - c) + s**2 * (q - d))
+        else:
+            values = 6.0 / h**2 * (r * (p - 2.0 * c + d) + s * (c - 2.0 * d + q))
+        inside = ((moments >= self.times[0]) & (moments <= self.times[-1]))[..., None]
+        return np.asarray(np.where(inside, values, 0.0))
 
     def _control(self, k: Ints) -> tuple[Floats, Floats, Floats, Floats]:
         """Return the Bézier control points of cubics; each cubic lies in their convex hull."""
         third = (np.diff(self.times)[k] / 3.0)[..., None]
-        before, after = self.positions[k], self.positions[k + 1]
-        return before, before + third * self.rates[k], after - third * self.rates[k + 1], after
+        p = self.positions[k]
+        q = self.positions[k + 1]
+        c = p + third * self.rates[k]
+        d = q - third * self.rates[k + 1]
+        return p, c, d, q
 
     def compute_extrema(self) -> tuple[Floats, Floats]:
-        """Compute the exact smallest and largest positions on each cubic, shape (K − 1, n) each."""
+        """Compute the exact smallest and largest positions on each cubic, shape (K − 1, n) each.
+
+        They are at the ends, or where the velocity is zero. At the fraction s, this is h/3 times
+
+            first (1 - s)² + 2 middle s (1 - s) + last s²
+
+        with first = c - p, middle = d - c and last = q - d. The zeros are
+
+            s = (first - middle ± root) / (first - 2 middle + last)
+              = first / (first - middle ∓ root),    root² = middle² - first last
+
+        of which the second form holds for a parabola that is a line, too.
+        """
         p, c, d, q = self._control(np.arange(len(self.times) - 1))
-        first, middle, last = c - p, d - c, q - d
-        bend, sides = first - 2.0 * middle + last, [p, q]
+        first = c - p
+        middle = d - c
+        last = q - d
+        bend = first - 2.0 * middle + last
         root = np.sqrt(np.maximum(middle**2 - first * last, 0.0))
+        extrema = [p, q]
         for sign in (-1.0, 1.0):
-            # Zeros of the velocity, first·(1−s)² + 2·middle·s(1−s) + last·s².
-            straight = first - middle + sign * root
-            other = first - middle - sign * root
-            at = np.divide(
-                straight,
-                bend,
-                out=np.divide(first, other, out=np.zeros_like(p), where=other != 0.0),
-                where=bend != 0.0,
-            )
-            sides.append(_bernstein(np.clip(at, 0.0, 1.0), p, c, d, q))
-        return np.asarray(np.min(sides, axis=0)), np.asarray(np.max(sides, axis=0))
+            numerator = first - middle + sign * root
+            denominator = first - middle - sign * root
+            zero = np.divide(first, denominator, out=np.zeros_like(p), where=denominator != 0.0)
+            zero = np.divide(numerator, bend, out=zero, where=bend != 0.0)
+            extrema.append(_bernstein(np.clip(zero, 0.0, 1.0), p, c, d, q))
+        return np.asarray(np.min(extrema, axis=0)), np.asarray(np.max(extrema, axis=0))
 
     def compute_max_rates(self) -> tuple[Floats, Floats]:
-        """Compute the exact largest |velocity| and |acceleration| of cubics, (K − 1, n) each."""
+        """Compute the exact largest |velocity| and |acceleration| of cubics, (K − 1, n) each.
+
+        The velocity first (1 - s)² + 2 middle s (1 - s) + last s² is a parabola in the fraction s,
+        with its vertex at s = (first - middle) / (first - 2 middle + last). The acceleration is
+        linear, so that it is largest at an end.
+        """
         h = np.diff(self.times)[:, None]
         p, c, d, q = self._control(np.arange(len(h)))
-        first, middle, last = (3.0 / h * part for part in (c - p, d - c, q - d))
+        first = 3.0 / h * (c - p)
+        middle = 3.0 / h * (d - c)
+        last = 3.0 / h * (q - d)
         bend = first - 2.0 * middle + last
-        at = np.divide(
-            first - middle, bend, out=np.full_like(bend, -1.0), where=np.abs(bend) > 1e-12
-        )
-        at = np.where((at > 0.0) & (at < 1.0), at, 0.0)  # vertex of the velocity, a parabola
-        between = (1.0 - at) ** 2 * first + 2.0 * at * (1.0 - at) * middle + at**2 * last
+        is_bent = np.abs(bend) > _MIN_BEND
+        vertex = np.divide(first - middle, bend, out=np.full_like(bend, -1.0), where=is_bent)
+        s = np.where((vertex > 0.0) & (vertex < 1.0), vertex, 0.0)
+        between = (1.0 - s) ** 2 * first + 2.0 * s * (1.0 - s) * middle + s**2 * last
         fastest = np.max(np.abs([first, last, between]), axis=0)
         strongest = np.max(np.abs([2.0 / h * (middle - first), 2.0 / h * (last - middle)]), axis=0)
         return np.asarray(fastest), np.asarray(strongest)
@@ -186,21 +206,22 @@ class Curve:
             raise InputError(
                 "wrong number of coordinates", field="curve.positions", expected=expected, got=got
             )
-        at = np.minimum(np.searchsorted(self.times, times), len(self.times) - 1)
-        if at[0] != 0 or at[-1] != len(self.times) - 1 or not np.array_equal(self.times[at], times):
+        last = len(self.times) - 1
+        at = np.minimum(np.searchsorted(self.times, times), last)
+        has_ends = at[0] == 0 and at[-1] == last
+        if not has_ends or not np.array_equal(self.times[at], times):
             raise InputError(
                 "a waypoint is none of its knots",
                 field="curve.times",
                 expected="the times of all waypoints",
             )
         apart = np.abs(self.positions[at] - positions).max(axis=1)
-        if not apart.max() <= _OFF:
-            where, got = f"positions[{int(np.argmax(apart))}]", f"{apart.max():g} apart"
+        if not apart.max() <= _MAX_DISTANCE:
             raise InputError(
                 "the curve does not lead through a waypoint",
-                field=where,
-                expected=f"at most {_OFF:g}",
-                got=got,
+                field=f"positions[{int(np.argmax(apart))}]",
+                expected=f"at most {_MAX_DISTANCE:g}",
+                got=f"{apart.max():g} apart",
             )
 
     def shift_time(self, time: float) -> Curve:
@@ -250,10 +271,13 @@ def sample_intervals(knots: Floats, shares: Floats, *, last: bool = False) -> Fl
 
 def concatenate_curves(pieces: Sequence[Curve]) -> Curve:
     """Concatenate curves; each begins at the position and velocity where its predecessor ends."""
-    times, first = [pieces[0].times], pieces[0]
+    first = pieces[0]
+    times = [first.times]
+    positions = [first.positions]
+    rates = [first.rates]
     for piece in pieces[1:]:
-        times.append(times[-1][-1] + piece.times[1:] - piece.times[0])
-    rest = pieces[1:]
-    positions = np.concatenate([first.positions, *(piece.positions[1:] for piece in rest)])
-    rates = np.concatenate([first.rates, *(piece.rates[1:] for piece in rest)])
-    return Curve(np.concatenate(times), positions, rates)
+        end = times[-1][-1]
+        times.append(end + piece.times[1:] - piece.times[0])
+        positions.append(piece.positions[1:])
+        rates.append(piece.rates[1:])
+    return Curve(np.concatenate(times), np.concatenate(positions), np.concatenate(rates))

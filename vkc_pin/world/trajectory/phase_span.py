@@ -41,8 +41,9 @@ class PhaseSpan:
             object.__setattr__(self, name, waypoint)
         object.__setattr__(self, "holds", check_hold_order(self.holds))
         if self.opening is not None:
-            field, expected = "PhaseSpan.opening", "a distance [m]"
-            opening = check_number(self.opening, field, expected, low=0.0, high=1.0)
+            opening = check_number(
+                self.opening, "PhaseSpan.opening", "a distance [m]", low=0.0, high=1.0
+            )
             object.__setattr__(self, "opening", opening)
 
     @property

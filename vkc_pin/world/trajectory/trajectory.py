@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -64,16 +64,10 @@ class Trajectory:
         return f"<Trajectory {self.times[-1]:.1f} s, {len(self.times)} waypoints: {names}>"
 
     def __post_init__(self) -> None:
-        listed: tuple[Any, ...] = check_list(self.names, "Trajectory.names", "a list of names")
-        names = tuple(
-            check_text(name, f"Trajectory.names[{k}]", "a name") for k, name in enumerate(listed)
-        )
+        names = _check_names(self.names)
         phases = check_list(self.phases, "Trajectory.phases", "a list of PhaseSpan", PhaseSpan)
         times = check_finite_array(self.times, "Trajectory.times")
         positions = check_finite_array(self.positions, "Trajectory.positions")
-        counts = Counter(names)
-        if (twice := next((name for name in names if counts[name] > 1), None)) is not None:
-            raise InputError("a name occurs twice", field="Trajectory.names", got=twice)
         if times.ndim != 1 or len(times) < 2 or not np.all(np.diff(times) > 0):
             raise InputError(
                 "times do not increase",
@@ -86,29 +80,20 @@ class Trajectory:
                 "wrong shape", field="Trajectory.positions", expected=shape, got=positions.shape
             )
         size = check_integer(self.robot_size, "Trajectory.robot_size", low=3, high=len(names))
-        edges = [0, *(phase.last for phase in phases)]
-        if edges[-1] != len(times) - 1 or any(
-            phase.first != before or phase.last <= before
-            for phase, before in zip(phases, edges, strict=False)
-        ):
-            problem = "phases do not follow one another from the first waypoint to the last"
-            got = ", ".join(f"{phase.first} to {phase.last}" for phase in phases[:20]) or "none"
-            raise InputError(
-                problem, field="Trajectory.phases", expected=f"0 to {len(times) - 1}", got=got
-            )
+        _check_order(phases, len(times) - 1)
         if self.curve is not None:
             check_instance(self.curve, Curve, "Trajectory.curve").check_through(times, positions)
-        for array in (times, positions):
-            array.setflags(write=False)
-        kept = {
+        times.setflags(write=False)
+        positions.setflags(write=False)
+        checked = {
             "names": names,
             "times": times,
             "positions": positions,
             "phases": phases,
             "robot_size": size,
         }
-        for key, value in kept.items():
-            object.__setattr__(self, key, value)
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
 
     def at(self, time: ArrayLike) -> Floats:
         """Return positions, shape (..., n), at `time` [s], shape (...,), clamped to the motion.
@@ -179,21 +164,21 @@ class Trajectory:
         Raises:
             UnknownNameError: There is no such coordinate.
         """
-        return np.array(
-            self.positions[:, self.names.index(check_choice(name, self.names, "coordinate"))]
-        )
+        column = self.names.index(check_choice(name, self.names, "coordinate"))
+        return np.array(self.positions[:, column])
 
     def ranges(self) -> tuple[Floats, Floats]:
         """Return the smallest and largest positions of every segment, shape (T − 1, n) each."""
         if self.curve is None:
-            return np.minimum(self.positions[:-1], self.positions[1:]), np.maximum(
-                self.positions[:-1], self.positions[1:]
-            )
+            before = self.positions[:-1]
+            after = self.positions[1:]
+            return np.minimum(before, after), np.maximum(before, after)
+        # The knots of a segment are those from its first waypoint to its last.
         begins = np.searchsorted(self.curve.times, self.times[:-1])
         low, high = self.curve.compute_extrema()
-        return np.asarray(np.minimum.reduceat(low, begins)), np.asarray(
-            np.maximum.reduceat(high, begins)
-        )
+        smallest = np.asarray(np.minimum.reduceat(low, begins))
+        largest = np.asarray(np.maximum.reduceat(high, begins))
+        return smallest, largest
 
     def velocities(self) -> Floats:
         """Return the mean velocity of every segment, shape (T − 1, n), [m/s] and [rad/s]."""
@@ -206,12 +191,10 @@ class Trajectory:
         motion starts and ends at rest. For accelerations of the curve see `acceleration`.
         """
         durations = np.diff(self.times)
-        velocity = np.vstack(
-            [np.zeros(len(self.names)), self.velocities(), np.zeros(len(self.names))]
-        )
-        spans = np.concatenate(
-            [durations[:1], np.minimum(durations[1:], durations[:-1]), durations[-1:]]
-        )
+        rest = np.zeros(len(self.names))
+        velocity = np.vstack([rest, self.velocities(), rest])
+        shorter = np.minimum(durations[1:], durations[:-1])
+        spans = np.concatenate([durations[:1], shorter, durations[-1:]])
         return np.asarray(np.diff(velocity, axis=0) / spans[:, None])
 
     def base_path_length(self) -> float:
@@ -233,20 +216,19 @@ class Trajectory:
 
     def parts(self) -> list[Trajectory]:
         """Return the motion of each phase, with its original times."""
-        spans = [slice(phase.first, phase.last + 1) for phase in self.phases]
-        alone = [replace(phase, first=0, last=phase.last - phase.first) for phase in self.phases]
-        return [
-            replace(
-                self,
-                times=self.times[span],
-                positions=self.positions[span],
-                phases=(phase,),
-                curve=None
-                if self.curve is None
-                else self.curve.part(self.times[span.start], self.times[span.stop - 1]),
+        found = list[Trajectory]()
+        for phase in self.phases:
+            rows = slice(phase.first, phase.last + 1)
+            times = self.times[rows]
+            alone = replace(phase, first=0, last=phase.last - phase.first)
+            curve = None
+            if self.curve is not None:
+                curve = self.curve.part(times[0], times[-1])
+            positions = self.positions[rows]
+            found.append(
+                replace(self, times=times, positions=positions, phases=(alone,), curve=curve)
             )
-            for span, phase in zip(spans, alone, strict=True)
-        ]
+        return found
 
     def metrics(self) -> dict[str, float]:
         """Return duration [s] and path lengths of base [m] and arm [rad]."""
@@ -266,7 +248,9 @@ class Trajectory:
             "robot_size": self.robot_size,
             "phases": [phase.to_dict() for phase in self.phases],
         }
-        return data if self.curve is None else {**data, "curve": self.curve.to_dict()}
+        if self.curve is not None:
+            data["curve"] = self.curve.to_dict()
+        return data
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Trajectory:
@@ -331,7 +315,9 @@ class Trajectory:
         Raises:
             InputError: A field is missing or invalid; the error names it.
         """
-        motion = None if like is None else check_instance(like, Trajectory, "like").to_dict()
+        motion = None
+        if like is not None:
+            motion = check_instance(like, Trajectory, "like").to_dict()
         data = ros.from_ros(message, like=motion, robot_size=robot_size)
         return cls._read(data, None if isinstance(message, Mapping) else message)
 
@@ -345,6 +331,34 @@ class Trajectory:
             raise InputError(
                 error.problem, file=file, field=field, expected=error.expected, got=error.got
             ) from error
+
+
+def _check_names(names: Any) -> tuple[str, ...]:
+    """Return the names of coordinates. Raises `InputError` if they are not unique texts."""
+    field = "Trajectory.names"
+    listed: tuple[Any, ...] = check_list(names, field, "a list of names")
+    found = tuple(check_text(name, f"{field}[{k}]", "a name") for k, name in enumerate(listed))
+    counts = Counter(found)
+    for name in found:
+        if counts[name] > 1:
+            raise InputError("a name occurs twice", field=field, got=name)
+    return found
+
+
+def _check_order(phases: Sequence[PhaseSpan], last: int) -> None:
+    """Check that phases follow one another from waypoint 0 to waypoint `last`."""
+    reached = 0
+    is_ordered = True
+    for phase in phases:
+        is_ordered = is_ordered and phase.first == reached and phase.last > reached
+        reached = phase.last
+    if not is_ordered or reached != last:
+        raise InputError(
+            "phases do not follow one another from the first waypoint to the last",
+            field="Trajectory.phases",
+            expected=f"0 to {last}",
+            got=", ".join(f"{phase.first} to {phase.last}" for phase in phases[:20]) or "none",
+        )
 
 
 class CurveSchema(Schema):

@@ -75,18 +75,21 @@ def read_archive(file: Path) -> Any:
         raise InputError(
             "unknown format", file=file, field="format", expected=FORMAT, got=about.get("format")
         )
-    motion, knots = dict[str, Any](), dict[str, Any]()
-    for name, array in arrays.items():
-        values = check_finite_array(array, name, file)
-        if name in _CURVE:
-            knots[name.removeprefix("knot_")] = values
+    checked = {name: check_finite_array(array, name, file) for name, array in arrays.items()}
+    if isinstance(about, dict) and isinstance(about.get("trajectory"), dict):
+        about["trajectory"] |= nest_knots(checked)
+    return about
+
+
+def nest_knots(arrays: Mapping[str, Any]) -> dict[str, Any]:
+    """Return arrays of a motion as in its data: those called `knot_<name>` are in its `curve`."""
+    motion = dict[str, Any]()
+    for name, values in arrays.items():
+        if name.startswith("knot_"):
+            motion.setdefault("curve", {})[name.removeprefix("knot_")] = values
         else:
             motion[name] = values
-    if knots:
-        motion["curve"] = knots
-    if isinstance(about, dict) and isinstance(about.get("trajectory"), dict):
-        about["trajectory"] |= motion
-    return about
+    return motion
 
 
 def _read_arrays(data: bytes) -> dict[str, Any]:

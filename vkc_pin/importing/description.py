@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 Colour = tuple[float, float, float, float]
 Limits = tuple[float, float]
+MOVING_KINDS = ("revolute", "continuous", "prismatic")
+"""Kinds of joints that have a position."""
 _RESISTANCES = ("damping", "friction", "stiffness")
 _SIDES = 48  # facets of a cylinder mesh
 SOLIDS = {

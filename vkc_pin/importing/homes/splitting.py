@@ -10,9 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.importing.description import Description, Joint, Link
+from vkc_pin.importing.description import MOVING_KINDS, Description, Joint, Link
 from vkc_pin.importing.objects.clean_up import (
-    MOVING,
     collect_attached_links,
     compute_bounds,
     find_closed_positions,
@@ -98,7 +97,7 @@ def split_home(description: Description) -> Home:
         children = [
             child
             for child, joint in joints.items()
-            if joint.parent == name and joint.kind in MOVING
+            if joint.parent == name and joint.kind in MOVING_KINDS
         ]
         large = name == description.root or _measure_length(link) > _BUILDING
         if children and not large:
@@ -123,7 +122,7 @@ def split_home(description: Description) -> Home:
         part = _extract_links(description, name, links_of_object)
         fixed_joints = dict(part.joints)
         for child, joint in part.joints.items():
-            if joint.kind in MOVING:
+            if joint.kind in MOVING_KINDS:
                 fixed_joints[child] = joint.fix(values.get(joint.name, 0.0))
                 notes.append(f"joint '{joint.name}' belongs to the free object '{name}': fixed")
         rigid = dataclasses.replace(part, joints=fixed_joints)

@@ -11,15 +11,13 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
-from vkc_pin.importing.description import Description, Link, Part
+from vkc_pin.importing.description import MOVING_KINDS, Description, Link, Part
 from vkc_pin.utils.arrays import Floats
 
 if TYPE_CHECKING:
     import trimesh
 
 
-MOVING = ("revolute", "continuous", "prismatic")
-"""Kinds of joints that have a position."""
 Surfaces = Mapping[int, "trimesh.Trimesh"]
 """Surfaces of parts in the frame of their link, by `id` of the part."""
 _UP = {"z": np.eye(3), "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])}
@@ -87,7 +85,7 @@ def fix_immovable_joints(description: Description) -> Description:
     notes = list(description.notes)
     closed_positions = find_closed_positions(description)
     for child, joint in description.joints.items():
-        if joint.kind not in MOVING:
+        if joint.kind not in MOVING_KINDS:
             continue
         moved_links = [
             description.links[name] for name in collect_attached_links(description, child)

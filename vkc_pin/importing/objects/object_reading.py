@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from vkc_pin.importing.description import Description
+from vkc_pin.importing.description import MOVING_KINDS, Description
 from vkc_pin.importing.formats.reading import read_description
 from vkc_pin.importing.objects.mechanisms import dissolve_mechanisms
 
@@ -15,7 +15,6 @@ WEIGHTLESS = (
     "no mass is stated: arm torques ignore weight and inertia, and simulation assumes a density"
 )
 """Note about an object whose file states no masses."""
-_KINDS = ("fixed", "revolute", "continuous", "prismatic")
 
 
 def read_object(
@@ -65,7 +64,7 @@ def _fix_other_joints(description: Description) -> Description:
     joints = dict(description.joints)
     notes = list[str]()
     for child, joint in description.joints.items():
-        if joint.kind not in (*_KINDS, "floating"):
+        if joint.kind not in ("fixed", *MOVING_KINDS, "floating"):
             notes.append(f"joint '{joint.name}' is {joint.kind}: taken as fixed")
             joints[child] = replace(joint, kind="fixed", limits=None)
     return replace(description.add_notes(*notes), joints=joints)

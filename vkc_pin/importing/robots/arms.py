@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.importing.description import MOVING_KINDS
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.words import list_words, split_words
 from vkc_pin.world.files.srdf import SrdfGroup
@@ -17,7 +18,6 @@ from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.models.robot_model import build_full_model, find_joint_limits
 from vkc_pin.world.models.wheels import has_wheel_name
 
-_MOVING = ("revolute", "continuous", "prismatic")
 _FINGER = 7  # largest number of joints of a finger
 _ARM = 3  # smallest number of joints of an arm with a hand; one more without a hand
 _BESIDE = 0.5  # smallest length of a palm beside a jaw, relative to the jaw's
@@ -63,7 +63,7 @@ class Body:
         """Whether the parent joint can be planned: it moves by one independent coordinate."""
         return (
             self.joint is not None
-            and self.joint.get("type") in _MOVING
+            and self.joint.get("type") in MOVING_KINDS
             and self.joint.find("mimic") is None
         )
 

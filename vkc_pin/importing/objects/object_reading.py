@@ -48,12 +48,13 @@ def _remove_free_bodies(description: Description) -> Description:
     If there is nothing but one free body, it is the object.
     """
     free = [child for child, joint in description.joints.items() if joint.kind == "floating"]
-    gone = set[str]().union(*(description.subtree(child) for child in free))
-    rest = [link for name, link in description.links.items() if name not in gone]
-    is_alone = not any(link.solid for link in rest)
+    gone = set[str]()
+    for child in free:
+        gone |= description.subtree(child)
+    links = {name: link for name, link in description.links.items() if name not in gone}
+    is_alone = not any(link.solid for link in links.values())
     if is_alone and len(free) == 1:
         return description.extract_subtree(free[0])
-    links = {name: link for name, link in description.links.items() if name not in gone}
     joints = {child: joint for child, joint in description.joints.items() if child not in gone}
     notes = [f"body '{child}' is free, hence a separate object: left out" for child in free]
     return description.add_notes(*notes).keep(links, joints)

@@ -59,8 +59,8 @@ def read_source(
     file: Path,
     scratch: Path,
     *,
-    packages: Mapping[str, Path],
-    arguments: Mapping[str, str],
+    packages: Mapping[str, str | Path] | None = None,
+    arguments: Mapping[str, str] | None = None,
     srdf: Path | None = None,
 ) -> Source:
     """Read a robot from a file; see `read_description`.
@@ -84,7 +84,7 @@ def read_source(
     root = make_urdf(description, file.stem)
     check_tree(file, root)
     text = ElementTree.tostring(root, encoding="unicode")
-    read = UrdfFile(file.resolve(), text, root, dict(packages))
+    read = UrdfFile(file.resolve(), text, root)
     semantics, notes = _read_semantics(file, srdf, root)
     states = [SrdfState(name, "", state) for name, state in description.states.items()]
     return Source(

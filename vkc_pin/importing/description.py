@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 Colour = tuple[float, float, float, float]
 Limits = tuple[float, float]
+MOVING_KINDS = ("revolute", "continuous", "prismatic")
+"""Kinds of joints that have a position."""
 _RESISTANCES = ("damping", "friction", "stiffness")
 _SIDES = 48  # facets of a cylinder mesh
 SOLIDS = {
@@ -55,6 +57,20 @@ class Part:
     triangles: trimesh.Trimesh | None = None
     colour: Colour | None = None
 
+    @classmethod
+    def from_triangles(
+        cls, name: str, triangles: trimesh.Trimesh, colour: Colour | None = None
+    ) -> Part:
+        """Return a mesh in the frame of its link [m]."""
+        return cls(
+            name=name,
+            placement=pin.SE3.Identity(),
+            kind="mesh",
+            size=(1.0, 1.0, 1.0),
+            triangles=triangles,
+            colour=colour,
+        )
+
     def transform(self, placement: pin.SE3) -> Part:
         """Return the shape in a frame in which its link's frame is at `placement`."""
         return replace(self, placement=placement * self.placement)
@@ -70,13 +86,14 @@ class Part:
         elif self.kind == "box":
             mesh = trimesh.creation.box(self.size)
         elif self.kind == "sphere":
-            mesh = trimesh.creation.icosphere(subdivisions=3, radius=self.size[0])
+            (radius,) = self.size
+            mesh = trimesh.creation.icosphere(subdivisions=3, radius=radius)
         elif self.kind == "capsule":
-            mesh = trimesh.creation.capsule(
-                height=self.size[1], radius=self.size[0], count=[_SIDES, _SIDES]
-            )
+            radius, length = self.size
+            mesh = trimesh.creation.capsule(height=length, radius=radius, count=[_SIDES, _SIDES])
         else:
-            mesh = trimesh.creation.cylinder(self.size[0], height=self.size[1], sections=_SIDES)
+            radius, length = self.size
+            mesh = trimesh.creation.cylinder(radius, height=length, sections=_SIDES)
         return mesh.apply_transform(self.placement.homogeneous)
 
     def compute_inertia(self, density: float) -> pin.Inertia:
@@ -330,27 +347,23 @@ class Description:
         if link not in self.links:
             raise UnknownNameError("link", link, self.links, file=self.file, field="link")
         subtree = self.subtree(link)
-        links = {name: item for name, item in self.links.items() if name in subtree}
-        joints = {
-            child: joint
-            for child, joint in self.joints.items()
-            if child in subtree and child != link
-        }
+        links = {name: self.links[name] for name in self.links if name in subtree}
+        below = subtree - {link}
+        joints = {child: self.joints[child] for child in self.joints if child in below}
         return self.keep(links, joints)
 
     def keep(self, links: Mapping[str, Link], joints: Mapping[str, Joint]) -> Description:
         """Return the description with some of its links and joints, and what belongs to them."""
         names = {joint.name for joint in joints.values()}
-        couplings = [
-            coupling
-            for coupling in self.couplings
-            if coupling.joint in names and (coupling.leader is None or coupling.leader in names)
-        ]
+        couplings = list[Coupling]()
+        for coupling in self.couplings:
+            has_leader = coupling.leader is None or coupling.leader in names
+            if coupling.joint in names and has_leader:
+                couplings.append(coupling)
         loops = [loop for loop in self.loops if set(loop.links) <= links.keys()]
-        states = {
-            name: {joint: value for joint, value in state.items() if joint in names}
-            for name, state in self.states.items()
-        }
+        states = dict[str, dict[str, float]]()
+        for name, state in self.states.items():
+            states[name] = {joint: state[joint] for joint in state if joint in names}
         return replace(
             self,
             links=links,
@@ -378,21 +391,17 @@ class Description:
             renamed_joints[links[child]] = replace(
                 joint, name=joints[child], parent=links[joint.parent], child=links[child]
             )
-        couplings = [
-            replace(
-                coupling,
-                joint=new_names[coupling.joint],
-                leader=new_names.get(coupling.leader or "", coupling.leader),
-            )
-            for coupling in self.couplings
-        ]
-        loops = [
-            replace(loop, links=(links[loop.links[0]], links[loop.links[1]])) for loop in self.loops
-        ]
-        states = {
-            name: {new_names[joint]: value for joint, value in state.items()}
-            for name, state in self.states.items()
-        }
+        couplings = list[Coupling]()
+        for coupling in self.couplings:
+            leader = new_names.get(coupling.leader or "", coupling.leader)
+            couplings.append(replace(coupling, joint=new_names[coupling.joint], leader=leader))
+        loops = list[Loop]()
+        for loop in self.loops:
+            first, second = loop.links
+            loops.append(replace(loop, links=(links[first], links[second])))
+        states = dict[str, dict[str, float]]()
+        for name, state in self.states.items():
+            states[name] = {new_names[joint]: value for joint, value in state.items()}
         return replace(
             self,
             links=renamed_links,
@@ -441,19 +450,21 @@ class Description:
     def subtree(self, link: str) -> set[str]:
         """Return a link and all its descendants."""
         children = self.children()
-        found, ahead = {link}, [link]
+        found = {link}
+        ahead = [link]
         while ahead:
-            new = [child for child in children.get(ahead.pop(), ()) if child not in found]
-            found.update(new)
-            ahead += new
+            for child in children.get(ahead.pop(), ()):
+                if child not in found:
+                    found.add(child)
+                    ahead.append(child)
         return found
 
     def children(self) -> dict[str, list[str]]:
         """Return the children of each link that has any."""
-        found: dict[str, list[str]] = {}
+        children = dict[str, list[str]]()
         for child, joint in self.joints.items():
-            found.setdefault(joint.parent, []).append(child)
-        return found
+            children.setdefault(joint.parent, []).append(child)
+        return children
 
 
 def make_missing_error(errors: Sequence[InputError], file: Path) -> InputError:

@@ -23,6 +23,8 @@ from vkc_pin.world.scene.scene import START_CLEARANCE, Scene
 _ROOM = 3.0  # [m] of floor around the base of a robot
 _DISTANCES = np.arange(1.2, 6.0, 0.2)  # [m] of the start from the object's grasp
 _MARGIN = 2.0  # [m] of floor around start and object
+HORIZONTAL = 0.5
+"""Horizontal part of a grasp's approach, a unit vector, up to which it is one from above."""
 
 
 def locate_robot(robot: str | Path | Robot) -> str:
@@ -30,7 +32,8 @@ def locate_robot(robot: str | Path | Robot) -> str:
     if isinstance(robot, Robot):
         described = robot.urdf.parent / "robot.yaml"
         file = described if described.is_file() else robot.urdf
-        return robot.name if list_robots().get(robot.name) == file else str(file.resolve())
+        is_bundled = list_robots().get(robot.name) == file
+        return robot.name if is_bundled else str(file.resolve())
     by_path = isinstance(robot, Path) or robot.endswith((".urdf", ".yaml", ".yml")) or "/" in robot
     return str(Path(robot).resolve()) if by_path else str(robot)
 
@@ -81,41 +84,60 @@ def make_object_scene(
         robot: The robot, see `locate_robot`.
         folder: Folder of the scene.
     """
-    place, back = np.zeros(2), np.array([-1.0, 0.0])
-    if proposals.found:
-        attachment = proposals.found[0].attachment
-        item = proposals.object
-        state = np.clip(np.zeros(len(item.lower)), item.lower, item.upper)
-        tool = item.link_placement(attachment.link, state) * attachment.placement
-        place, direction = tool.translation[:2], tool.rotation[:2, 2]
-        if (length := float(np.linalg.norm(direction))) > 0.5:  # else from above
-            back = -direction / length
-        elif np.linalg.norm(place) > 0.0:
-            back = place / np.linalg.norm(place)
-    else:
-        place = -0.5 * np.array([size[0], 0.0])
+    place, back = _find_start_line(proposals, size)
+    yaw = float(np.arctan2(-back[1], -back[0]))
     name = Path(file).stem
     for distance in _DISTANCES:
         x, y = (place + distance * back).tolist()
-        yaw = float(np.arctan2(-back[1], -back[0]))
         corners = np.array([[x, y], -0.5 * size[:2], 0.5 * size[:2]])
-        low, high = corners.min(axis=0) - _MARGIN, corners.max(axis=0) + _MARGIN
+        low = corners.min(axis=0) - _MARGIN
+        high = corners.max(axis=0) + _MARGIN
         document = {
             "name": name,
             "robot": robot,
             "start": {"base": [round(x, 3), round(y, 3), round(yaw, 4)], "arm": "home"},
             "arena": {
-                axis: [round(float(low[k]), 3), round(float(high[k]), 3)]
-                for k, axis in enumerate("xy")
+                "x": round_interval(low[0], high[0]),
+                "y": round_interval(low[1], high[1]),
             },
             "objects": [{"name": name, "type": file, "position": [0.0, 0.0, 0.0]}],
         }
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # they are repeated when the scene is loaded
+            # They are repeated when the scene is loaded.
+            warnings.simplefilter("ignore")
             try:
                 scene = Scene.from_document(document, folder)
-            except InputError:  # the start collides
+            except InputError:
+                # The start collides.
                 continue
         if scene.start_clearance(reach=1.0) >= START_CLEARANCE:
             return document
     return None
+
+
+def _find_start_line(proposals: Proposals, size: Floats) -> tuple[Floats, Floats]:
+    """Return a point and a direction, shape (2,) each, of the line of a robot that faces an object.
+
+    The line begins below the best grasp, and leads away from it against the approach. For a grasp
+    from above, it leads away from the object's centre. Without a grasp, it begins at the front.
+    """
+    back = np.array([-1.0, 0.0])
+    if not proposals.found:
+        return -0.5 * np.array([size[0], 0.0]), back
+    attachment = proposals.found[0].attachment
+    item = proposals.object
+    state = np.clip(np.zeros(len(item.lower)), item.lower, item.upper)
+    tool = item.link_placement(attachment.link, state) * attachment.placement
+    place = tool.translation[:2]
+    direction = tool.rotation[:2, 2]
+    length = float(np.linalg.norm(direction))
+    if length > HORIZONTAL:
+        back = -direction / length
+    elif np.linalg.norm(place) > 0.0:
+        back = place / np.linalg.norm(place)
+    return place, back
+
+
+def round_interval(low: float, high: float) -> list[float]:
+    """Return both ends of an interval of a scene's arena, rounded to millimetres [m]."""
+    return [round(float(low), 3), round(float(high), 3)]

@@ -25,18 +25,20 @@ def format_comment(text: str) -> str:
 
     Backslashes and unprintable characters, line breaks among them, become Python's escapes.
     """
-    line = "".join(
-        letter
-        if letter.isprintable() and letter != "\\"
-        else letter.encode("unicode_escape").decode("ascii")
-        for letter in text
-    )
+    line = ""
+    for letter in text:
+        if letter.isprintable() and letter != "\\":
+            line += letter
+        else:
+            line += letter.encode("unicode_escape").decode("ascii")
     return f"# {line}\n"
 
 
 def round_values(values: Any, digits: int = 6) -> list[float]:
     """Return rounded values without negative zeros."""
-    return [float(value) + 0.0 for value in np.round(np.asarray(values, float), digits) + 0.0]
+    rounded = np.round(np.asarray(values, float), digits)
+    # -0.0 + 0.0 is 0.0.
+    return [float(value) for value in rounded + 0.0]
 
 
 def check_source(file: Path, expected: str) -> None:
@@ -59,20 +61,26 @@ def check_target(folder: Path, command: str, *, force: bool) -> None:
         force: Whether the command may replace its own earlier output.
     """
     is_folder = os.path.isdir(folder)  # noqa: PTH112 - False also without permission to look
-    own = is_folder and any(
-        get_origin_marker(command) in _read_first_line(file) for file in folder.glob("*.yaml")
-    )
+    is_own = is_folder and _is_output(folder, command)
     is_free = not os.path.exists(folder) or (is_folder and not any(folder.iterdir()))  # noqa: PTH110
-    if is_free or (force and own):
-        check_writable(folder / MANIFEST, field="folder")  # before the work, not after it
+    if is_free or (force and is_own):
+        # Before the work, not after it.
+        check_writable(folder / MANIFEST, field="folder")
         return
-    expected, got = "a new or an empty folder", "other files" if is_folder else "a file"
-    if own:
+    expected = "a new or an empty folder"
+    got = "other files" if is_folder else "a file"
+    if is_own:
         expected += ", or force=True (--force) to replace it"
         got = f"an earlier output of {command}"
     raise InputError(
         "the target already exists", file=folder, field="folder", expected=expected, got=got
     )
+
+
+def _is_output(folder: Path, command: str) -> bool:
+    """Return whether a file of the folder says that the command wrote it."""
+    marker = get_origin_marker(command)
+    return any(marker in _read_first_line(file) for file in folder.glob("*.yaml"))
 
 
 def _read_first_line(file: Path) -> str:

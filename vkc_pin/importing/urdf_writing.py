@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.importing.description import Coupling, Description, Joint, Part
+from vkc_pin.importing.description import MOVING_KINDS, Coupling, Description, Joint, Part
 from vkc_pin.utils.arrays import MAX_COORDINATE
 from vkc_pin.world.files.kinematic_tree import MOMENTS
 from vkc_pin.world.files.xml import replace_forbidden
@@ -112,7 +112,7 @@ def _add_joint(root: ElementTree.Element, joint: Joint, coupling: Coupling | Non
     element = add_connection(
         root, joint.name, joint.kind, joint.parent, joint.child, joint.placement
     )
-    if joint.kind not in ("revolute", "continuous", "prismatic"):
+    if joint.kind not in MOVING_KINDS:
         return
     ElementTree.SubElement(element, "axis", xyz=_format_numbers(joint.axis))
     limit = ElementTree.SubElement(element, "limit")

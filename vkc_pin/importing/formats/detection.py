@@ -11,6 +11,7 @@ from vkc_pin.world.files.documents import read_head, read_text
 from vkc_pin.world.files.xml import parse_xml
 
 _HEAD = 4096  # bytes in which the first element of an XML file begins
+_BYTE_ORDER_MARK = b"\xef\xbb\xbf"  # of UTF-8, with which editors of Windows begin files
 _SIGNATURES = {
     b"#usda": "USD",
     b"PXR-USDC": "USD",
@@ -58,10 +59,9 @@ def read_root(file: Path, formats: str) -> tuple[str, ElementTree.Element]:
     Raises:
         InputError: The file cannot be read, is not XML, or has another format, which is named.
     """
-    head = read_head(file, formats, _HEAD).removeprefix(b"\xef\xbb\xbf").lstrip()
+    head = read_head(file, formats, _HEAD).removeprefix(_BYTE_ORDER_MARK).lstrip()
     if head and not head.startswith(b"<"):
-        matches = (name for start, name in _SIGNATURES.items() if head.startswith(start))
-        name = next(matches, _SUFFIXES.get(file.suffix.lower()))
+        name = _recognise_format(head, file)
         if name is not None:
             problem = f"{name} is not supported"
             expected = f"{formats}: export or convert it to one of these"
@@ -74,9 +74,21 @@ def read_root(file: Path, formats: str) -> tuple[str, ElementTree.Element]:
     return text, parse_xml(text, file)
 
 
+def _recognise_format(head: bytes, file: Path) -> str | None:
+    """Return the format of a file that is no XML by its first bytes, else by its suffix."""
+    for signature, name in _SIGNATURES.items():
+        if head.startswith(signature):
+            return name
+    return _SUFFIXES.get(file.suffix.lower())
+
+
 def check_no_arguments(file: Path, arguments: Mapping[str, str]) -> None:
     """Check that no arguments are given for a file that is not xacro."""
     if arguments:
-        problem = "only xacro files have arguments"
-        expected, got = "no arguments, or a xacro file", ", ".join(arguments)
-        raise InputError(problem, file=file, field="arguments", expected=expected, got=got)
+        raise InputError(
+            "only xacro files have arguments",
+            file=file,
+            field="arguments",
+            expected="no arguments, or a xacro file",
+            got=", ".join(arguments),
+        )

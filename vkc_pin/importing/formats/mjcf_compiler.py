@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +21,15 @@ _REDUCED = (
     "read without actuators, sensors, key frames, contact pairs and couplings, as MuJoCo "
     "rejects them"
 )
+_LISTED = 8  # missing textures in a note
 # What MuJoCo 2 knew and later versions reject: settings that do not matter for geometry.
 _SETTINGS = ("custom", "option", "size", "statistic", "visual")
 _COMPILER_SETTINGS = ("convexhull", "exactmeshinertia")
 # Orientations of an <inertial>, which MuJoCo 2 ignored beside `fullinertia`
 _ORIENTATIONS = ("axisangle", "euler", "quat", "xyaxes", "zaxis")
+
+_Repair = Callable[[Any, Path], list[str]]
+"""A change of a `mujoco.MjSpec`, which returns notes."""
 
 
 def compile_mjcf(file: Path) -> tuple[Any, list[str]]:
@@ -44,12 +49,22 @@ def compile_mjcf(file: Path) -> tuple[Any, list[str]]:
 
 
 def _compile(path: Path, file: Path) -> tuple[Any, list[str]]:
-    """Return model and notes of the file at an absolute `path`; messages name `file`."""
+    """Return model and notes of the file at an absolute `path`; messages name `file`.
+
+    A file that MuJoCo rejects is compiled again, first with other meshes in place of missing ones,
+    then without its dynamics, too.
+    """
     import mujoco
 
-    mujoco.set_mju_user_warning(lambda text: None)  # it would write MUJOCO_LOG.TXT
-    first = None
-    for repairs in (), (_replace_missing_meshes,), (_replace_missing_meshes, _remove_dynamics):
+    # MuJoCo would write warnings to MUJOCO_LOG.TXT.
+    mujoco.set_mju_user_warning(lambda text: None)
+    attempts: tuple[tuple[_Repair, ...], ...] = (
+        (),
+        (_replace_missing_meshes,),
+        (_replace_missing_meshes, _remove_dynamics),
+    )
+    first_error = None
+    for repairs in attempts:
         try:
             spec, notes = _parse(path)
             notes += _remove_looks(spec, file)
@@ -64,14 +79,18 @@ def _compile(path: Path, file: Path) -> tuple[Any, list[str]]:
         except (ValueError, RuntimeError) as error:
             if "allocate memory" in str(error):
                 raise MemoryError from error
-            first = first or error
+            first_error = first_error or error
             continue
         if _remove_dynamics in repairs:
-            notes.append(f"{_REDUCED} ({' '.join(str(first).split())})")
+            notes.append(f"{_REDUCED} ({_join_lines(first_error)})")
         return model, notes
-    raise InputError(
-        f"MuJoCo cannot read the file: {' '.join(str(first).split())}", file=file
-    ) from first
+    problem = f"MuJoCo cannot read the file: {_join_lines(first_error)}"
+    raise InputError(problem, file=file) from first_error
+
+
+def _join_lines(error: Exception | None) -> str:
+    """Return the message of an error in one line."""
+    return " ".join(str(error).split())
 
 
 def _parse(path: Path) -> tuple[Any, list[str]]:
@@ -88,7 +107,7 @@ def _parse(path: Path) -> tuple[Any, list[str]]:
         except (InputError, ValueError):
             raise error from None
         spec.modelfiledir = str(path.parent)
-        return spec, [f"read without settings of MuJoCo 2 ({' '.join(str(error).split())})"]
+        return spec, [f"read without settings of MuJoCo 2 ({_join_lines(error)})"]
 
 
 def _convert_from_mujoco_2(path: Path) -> str:
@@ -108,7 +127,8 @@ def _convert_from_mujoco_2(path: Path) -> str:
             for name in _COMPILER_SETTINGS:
                 element.attrib.pop(name, None)
         elif element.tag == "default" and element.get("class", "main") != "main":
-            main = root[list(root).index(element)] = ElementTree.Element("default")
+            main = ElementTree.Element("default")
+            root[list(root).index(element)] = main
             main.append(element)
     return ElementTree.tostring(root, encoding="unicode")
 
@@ -121,8 +141,9 @@ def _read_with_includes(file: Path, folder: Path, done: list[Path]) -> ElementTr
     root = parse_xml(read_text(file, "MJCF"), file)
     for parent in list(root.iter()):
         for include in parent.findall("include"):
-            name = include.get("file", "").replace("\\", "/")
-            included = _read_with_includes(Path(os.path.normpath(folder / name)), folder, done)
+            address = include.get("file", "").replace("\\", "/")
+            path = Path(os.path.normpath(folder / address))
+            included = _read_with_includes(path, folder, done)
             place = list(parent).index(include)
             parent[place : place + 1] = list(included)
     return root
@@ -130,17 +151,21 @@ def _read_with_includes(file: Path, folder: Path, done: list[Path]) -> ElementTr
 
 def _remove_looks(spec: Any, file: Path) -> list[str]:
     """Remove textures and skins; return a note about missing pictures."""
-    missing = [
-        name
-        for texture in spec.textures
-        for name in (texture.file, *texture.cubefiles)
-        if name and not is_file(_find_file(spec, texture, name, "texturedir"))
-    ]
+    missing = dict[str, None]()  # an ordered set
+    for texture in spec.textures:
+        for name in (texture.file, *texture.cubefiles):
+            if name and not is_file(_find_file(spec, texture, name, "texturedir")):
+                missing[name] = None
     for material in spec.materials:
         material.textures = [""] * len(list(material.textures))
     for element in (*spec.textures, *spec.skins):
         spec.delete(element)
-    return [f"missing textures, which only colour shapes: {_format_names(missing)}"] * bool(missing)
+    if not missing:
+        return []
+    listed = ", ".join(list(missing)[:_LISTED])
+    if len(missing) > _LISTED:
+        listed += f", ... ({len(missing)})"
+    return [f"missing textures, which only colour shapes: {listed}"]
 
 
 def _replace_missing_meshes(spec: Any, file: Path) -> list[str]:
@@ -149,28 +174,32 @@ def _replace_missing_meshes(spec: Any, file: Path) -> list[str]:
     Returns:
         A note about each missing mesh.
     """
-    missing = {
-        mesh.name or Path(mesh.file).stem: mesh
-        for mesh in spec.meshes
-        if mesh.file and not is_file(_find_file(spec, mesh, mesh.file, "meshdir"))
-    }
-    notes, lost = list[str](), list[str]()
-    for body in spec.bodies if missing else ():
+    missing = dict[str, Any]()  # meshes by name
+    for mesh in spec.meshes:
+        if mesh.file and not is_file(_find_file(spec, mesh, mesh.file, "meshdir")):
+            missing[mesh.name or Path(mesh.file).stem] = mesh
+    if not missing:
+        return []
+    notes = list[str]()
+    lost = list[str]()
+    for body in spec.bodies:
         geoms = list(body.geoms)
         gone = [geom for geom in geoms if geom.meshname in missing]
         others = [geom for geom in geoms if geom.meshname not in missing]
         for geom in gone:
-            mesh_file, collides = missing[geom.meshname].file, geom.contype or geom.conaffinity
-            looks = [other for other in others if not (other.contype or other.conaffinity)]
+            mesh_file = missing[geom.meshname].file
+            # Those that collide instead of an earlier geom are visual no more.
+            looks = [other for other in others if not _collides(other)]
             where = f"mesh '{mesh_file}' of body '{body.name}' does not exist"
-            if collides and not looks:
-                lost.append(mesh_file)
-            elif collides:
+            if not _collides(geom):
+                notes.append(f"{where}: left out, it is only visual")
+            elif looks:
                 notes.append(f"{where}: its visual shapes collide instead")
                 for other in looks:
-                    other.contype = other.conaffinity = 1
+                    other.contype = 1
+                    other.conaffinity = 1
             else:
-                notes.append(f"{where}: left out, it is only visual")
+                lost.append(mesh_file)
             spec.delete(geom)
     if lost:
         raise InputError(
@@ -188,18 +217,19 @@ def _remove_dynamics(spec: Any, file: Path) -> list[str]:
     """Remove what may refer to missing elements, and let MuJoCo mend inertias."""
     spec.compiler.balanceinertia = True
     kinds = (spec.actuators, spec.sensors, spec.keys, spec.pairs, spec.excludes, spec.equalities)
-    for element in (element for kind in kinds for element in kind):
-        spec.delete(element)
+    for elements in kinds:
+        for element in elements:
+            spec.delete(element)
     return []
+
+
+def _collides(geom: Any) -> bool:
+    return bool(geom.contype or geom.conaffinity)
 
 
 def _find_file(spec: Any, element: Any, address: str, folder: str) -> Path:
     """Return the file of an asset, which may lie in a `folder` of the compiler's settings."""
     name = Path(address).name if spec.strippath else address
-    settings = getattr(element, "compiler", spec)  # of the file that holds the asset
+    # Those of the file that holds the asset, which may be an included one.
+    settings = getattr(element, "compiler", spec)
     return Path(spec.modelfiledir, getattr(settings, folder), name)
-
-
-def _format_names(names: list[str]) -> str:
-    distinct = list(dict.fromkeys(names))
-    return ", ".join(distinct[:8]) + (f", ... ({len(distinct)})" if len(distinct) > 8 else "")

@@ -9,13 +9,15 @@ import xml.etree.ElementTree as ElementTree
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.importing.description import (
+    MOVING_KINDS,
+    Colour,
     Coupling,
     Description,
     Joint,
@@ -43,9 +45,9 @@ _MASS = 1.0  # [kg]
 _MOMENT = 1.0  # [kg·m²] about each axis
 _DENSITY = 1000.0  # [kg/m³] of a shape whose inertia is computed
 _DIAGONAL = ("ixx", "iyy", "izz")
-_MOVING = ("revolute", "continuous", "prismatic")
+_GREY: Colour = (0.8, 0.8, 0.8, 1.0)  # of a shape whose <diffuse> has less than three numbers
 _SIDES = 48  # facets of a cone
-_JOINT_TYPES = ("fixed", *_MOVING, "ball", "universal", "revolute2", "screw", "gearbox")
+_JOINT_TYPES = ("fixed", *MOVING_KINDS, "ball", "universal", "revolute2", "screw", "gearbox")
 # Elements of a <limit> and their defaults, by the specification; a rate of -1 means no limit
 _LIMITS = {"lower": "-1e16", "upper": "1e16", "velocity": "-1", "effort": "-1"}
 # Numbers of each shape: name of the element and count
@@ -75,6 +77,26 @@ def read_sdf_description(file: Path, packages: Mapping[str, Path]) -> Descriptio
         raise InputError("models or frames are nested too deeply", file=file) from None
 
 
+class _SdfLink(NamedTuple):
+    """A link: the model that defines it, and its name there."""
+
+    scope: Scope
+    local: str
+
+
+class _SdfJoint(NamedTuple):
+    """A joint: the model that defines it, its element, and the full name of its parent link."""
+
+    scope: Scope
+    element: ElementTree.Element
+    parent: str
+
+    @property
+    def name(self) -> str:
+        """Name in its model."""
+        return self.element.get("name", "")
+
+
 class _Reader:
     def __init__(self, file: Path, packages: Mapping[str, Path]) -> None:
         self.file = file
@@ -84,7 +106,8 @@ class _Reader:
         self.missing = list[MissingMesh]()
         self.couplings = list[Coupling]()  # of joints by their full names
         root, rules = self._load(file)
-        worlds, models = root.findall("world"), root.findall("model")
+        worlds = root.findall("world")
+        models = root.findall("model")
         if len(worlds) + len(models) != 1:
             got = f"{len(worlds)} worlds and {len(models)} models"
             raise InputError(
@@ -95,9 +118,8 @@ class _Reader:
             )
         self.is_world = bool(worlds)
         self.root = worlds[0] if worlds else models[0]
-        self.world = self._make_scope(
-            Scope(file, worlds[0] if worlds else root, rules), (file.resolve(),)
-        )
+        world = Scope(file, worlds[0] if worlds else root, rules)
+        self.world = self._make_scope(world, (file.resolve(),))
 
     def _load(self, file: Path) -> tuple[ElementTree.Element, Rules]:
         """Return the root of an SDF file and the rules of its version."""
@@ -105,13 +127,25 @@ class _Reader:
         if root.tag != "sdf":
             expected = "an element <sdf>"
             raise InputError("this is no SDF", file=file, expected=expected, got=f"<{root.tag}>")
-        if (
-            raw := next((item for item in root.iter() if item.tag.startswith("xacro:")), None)
-        ) is not None:
-            expected, got = "a plain SDF: xacro FILE > model.sdf", f"<{raw.tag}>"
-            raise make_element_error(
-                file, raw, "xacro has not been run", expected=expected, got=got
-            )
+        for element in root.iter():
+            if element.tag.startswith("xacro:"):
+                raise make_element_error(
+                    file,
+                    element,
+                    "xacro has not been run",
+                    expected="a plain SDF: xacro FILE > model.sdf",
+                    got=f"<{element.tag}>",
+                )
+        version = self._read_version(file, root)
+        rules = RULES[0]
+        for later in RULES:
+            if later.since <= version:
+                rules = later
+        self.notes += _note_other_versions(file, root, rules, version)
+        return root, rules
+
+    def _read_version(self, file: Path, root: ElementTree.Element) -> int:
+        """Return the minor version of an SDF file, with a note if it is missing or unknown."""
         text = root.get("version")
         match = re.fullmatch(
             r"\s*1\.(\d{1,3})(\.\d+)*\s*", f"1.{RULES[-1].since}" if text is None else text
@@ -130,9 +164,9 @@ class _Reader:
             self.notes.append(f"{file.name} states no version: read as SDF 1.{version}")
         if version > _NEWEST:
             self.notes.append(f"{file.name} has version 1.{version}: read as SDF 1.{_NEWEST}")
-        rules = next(rules for rules in reversed(RULES) if rules.since <= version)
-        self.notes += _note_other_versions(file, root, rules, version)
-        return root, rules
+        return version
+
+    # Models
 
     def _make_scope(self, scope: Scope, files: tuple[Path, ...]) -> Scope:
         """Fill in the elements of a model or world; `files` are those that include it."""
@@ -140,17 +174,14 @@ class _Reader:
         if self.count > _MOST_MODELS:
             expected = f"at most {_MOST_MODELS}"
             raise InputError("too many models", file=self.file, expected=expected)
-        for tag, elements in (
-            ("link", scope.links),
-            ("joint", scope.joints),
-            ("frame", scope.frames),
-        ):
+        named_elements = {"link": scope.links, "joint": scope.joints, "frame": scope.frames}
+        for tag, elements in named_elements.items():
             for element in scope.element.findall(tag):
                 self._add(scope, elements, element, element)
         for element in scope.element.findall("model"):
             inner = Scope(scope.file, element, scope.rules, scope)
             self._add(scope, scope.models, element, inner)
-            self._fill_inner_scope(inner, files)
+            self._fill_inner_scope(inner, files, element.get("name", ""))
         for include in scope.element.findall("include"):
             self._include(scope, include, files)
         for tag in ("actor", "population", "road", "state"):
@@ -166,15 +197,15 @@ class _Reader:
             del scope.models[name]
         return scope
 
-    def _fill_inner_scope(
-        self, inner: Scope, files: tuple[Path, ...], name: str | None = None
-    ) -> None:
+    def _fill_inner_scope(self, inner: Scope, files: tuple[Path, ...], name: str) -> None:
         """Fill in a model inside another one or a world; name "": its names are the other's."""
-        assert inner.above is not None
-        name = inner.element.get("name", "") if name is None else name
-        is_only = inner.above.element.tag == "sdf"
-        inner.path = inner.above.path + (f"{name}::" if name and not is_only else "")
-        inner.active = inner.above.active
+        above = inner.above
+        assert above is not None
+        inner.path = above.path
+        # The only model of a file is the description itself: its names need no prefix.
+        if name and above.element.tag != "sdf":
+            inner.path += f"{name}::"
+        inner.active = above.active
         self._make_scope(inner, files)
 
     def _add(
@@ -183,15 +214,17 @@ class _Reader:
         """Add an item by the name of an element, which must be unique."""
         name = (element.get("name") or element.findtext("name") or "").strip()
         if not name:
-            problem, expected = f"a {element.tag} without a name", "a name"
-            raise make_element_error(scope.file, element, problem, expected=expected)
+            problem = f"a {element.tag} without a name"
+            raise make_element_error(scope.file, element, problem, expected="a name")
         if name in elements:
             kind = "model" if element.tag == "include" else element.tag
-            problem, expected = f"two {kind}s have the same name", f"a name for each {kind}"
+            problem = f"two {kind}s have the same name"
+            expected = f"a name for each {kind}"
             raise make_element_error(scope.file, element, problem, field=name, expected=expected)
         elements[name] = item
 
     def _include(self, scope: Scope, include: ElementTree.Element, files: tuple[Path, ...]) -> None:
+        """Add the model of another file, which <include> may rename or merge with this one."""
         file = _find_model(scope.file, include, self.packages)
         if file.resolve() in files:
             got = " → ".join(item.name for item in (*files, file))
@@ -202,8 +235,8 @@ class _Reader:
             self.notes.append(f"{file.name} is left out: it holds no model")
             return
         if len(models) != 1:
-            expected, got = "one <model>", f"{len(models)} models"
-            raise InputError("not a model", file=file, expected=expected, got=got)
+            got = f"{len(models)} models"
+            raise InputError("not a model", file=file, expected="one <model>", got=got)
         inner = Scope(file, models[0], rules, scope, include=include)
         files = (*files, file.resolve())
         if is_true(include.get("merge", "false")):
@@ -212,22 +245,38 @@ class _Reader:
             return
         named = include if include.findtext("name") else models[0]
         self._add(scope, scope.models, named, inner)
-        self._fill_inner_scope(
-            inner, files, (named.findtext("name") or named.get("name") or "").strip()
-        )
+        name = (named.findtext("name") or named.get("name") or "").strip()
+        self._fill_inner_scope(inner, files, name)
+
+    # The tree
 
     def read(self) -> Description:
         """Return the description; see `read_sdf_description`."""
         scopes = list(self.world.walk())
-        links: dict[str, tuple[Scope, str]] = {}
+        links = self._collect_links(scopes)
+        joints = self._collect_joints(scopes)
+        lines: dict[str, int | None] = {
+            name: find_line(link.scope.links[link.local]) for name, link in links.items()
+        }
+        if any(joint.parent == BASE for joint in joints.values()):
+            lines[BASE] = None
+        above = {child: (joint.parent, "") for child, joint in joints.items()}
+        roots = find_roots(self.file, lines, above)
+        return self._describe(links, joints, roots)
+
+    def _collect_links(self, scopes: Sequence[Scope]) -> dict[str, _SdfLink]:
+        """Return the links of all models by their full names."""
+        links = dict[str, _SdfLink]()
         for scope in scopes:
-            for name, link in scope.links.items():
-                if (key := scope.path + name) in links:
+            for local, link in scope.links.items():
+                name = scope.path + local
+                if name in links:
                     problem = "two links have the same name"
-                    raise make_element_error(scope.file, link, problem, field=key)
-                links[key] = scope, name
+                    raise make_element_error(scope.file, link, problem, field=name)
+                links[name] = _SdfLink(scope, local)
         if not links:
-            got = ", ".join(f"<{tag}>" for tag in dict.fromkeys(item.tag for item in self.root))
+            tags = dict.fromkeys(item.tag for item in self.root)
+            got = ", ".join(f"<{tag}>" for tag in tags)
             raise make_element_error(
                 self.file,
                 self.root,
@@ -236,85 +285,70 @@ class _Reader:
                 expected="<model>s with <link>s",
                 got=got or "nothing",
             )
-        joints: dict[str, tuple[Scope, ElementTree.Element, str]] = {}  # by the child link
+        return links
+
+    def _collect_joints(self, scopes: Sequence[Scope]) -> dict[str, _SdfJoint]:
+        """Return the joints of all models by the full names of their child links."""
+        joints = dict[str, _SdfJoint]()
         for scope in scopes:
-            for name, joint in scope.joints.items():
-                kind = self._read_kind(scope, joint)
-                if kind == "gearbox":
+            for name, element in scope.joints.items():
+                if self._read_kind(scope, element) == "gearbox":
                     self.notes.append(f"joint '{name}' couples other joints: left out")
                     continue
-                ends = [scope.find_link(scope.read_end(joint, key)) for key in ("parent", "child")]
-                if ends[1] in joints:
-                    problem, got = "a link with two parents", joints[ends[1]][1].get("name", "")
+                parent = scope.find_link(scope.read_end(element, "parent"))
+                child = scope.find_link(scope.read_end(element, "child"))
+                if child in joints:
                     raise make_element_error(
                         scope.file,
-                        joint,
-                        problem,
-                        field=ends[1],
+                        element,
+                        "a link with two parents",
+                        field=child,
                         expected="one joint",
-                        got=f"joints '{got}' and '{name}'",
+                        got=f"joints '{joints[child].name}' and '{name}'",
                     )
-                joints[ends[1]] = scope, joint, ends[0]
+                joints[child] = _SdfJoint(scope, element, parent)
         if BASE in joints:
-            scope, joint, _ = joints[BASE]
+            joint = joints[BASE]
             problem = "the world cannot be a child"
-            raise make_element_error(scope.file, joint, problem, field=joint.get("name"))
-        lines = {name: find_line(scope.links[local]) for name, (scope, local) in links.items()}
-        is_connected = any(parent == BASE for _, _, parent in joints.values())
-        above = {child: (parent, "") for child, (_, _, parent) in joints.items()}
-        roots = find_roots(self.file, {**lines, **({BASE: None} if is_connected else {})}, above)
-        return self._describe(links, joints, roots)
+            field = joint.element.get("name")
+            raise make_element_error(joint.scope.file, joint.element, problem, field=field)
+        return joints
 
     def _describe(
         self,
-        links: Mapping[str, tuple[Scope, str]],
-        joints: Mapping[str, tuple[Scope, ElementTree.Element, str]],
+        links: Mapping[str, _SdfLink],
+        joints: Mapping[str, _SdfJoint],
         roots: Mapping[str, str],
     ) -> Description:
+        """Return the description of links by full names, and joints by those of their children."""
         kinds = self._connect(links, joints, roots)
         names = self._choose_names(links, kinds)
+        labels = self._choose_joint_names(joints)
+        frames = self._place_links(links, joints, kinds)
         base = names[BASE]
-        repeated = Counter(joint.get("name", "") for _, joint, _ in joints.values())
-        frames = {BASE: pin.SE3.Identity()}
-        # Link frames are moved to their joints, so that axes pass through origins.
-        for name, (scope, local) in links.items():
-            if name in joints:
-                holder, joint, _ = joints[name]
-                frames[name] = holder.find_placement() * holder.find_joint_pose(joint)
-            elif name in kinds:
-                frames[name] = scope.find_placement(local)
-            else:
-                frames[name] = pin.SE3.Identity()
-        found_links = {base: Link(base)} if kinds or BASE in roots else {}
+        found_links = dict[str, Link]()
+        if kinds or BASE in roots:
+            found_links[base] = Link(base)
         found_joints = dict[str, Joint]()
-        for name, (scope, local) in links.items():
-            found_links[names[name]] = self._read_link(scope, local, names[name], frames[name])
-            if name in joints:
-                holder, joint, parent = joints[name]
-                label = str(joint.get("name"))
-                label = holder.path + label if repeated[label] > 1 else label
-                ends = (names[parent], names[name])
-                found_joints[names[name]] = self._read_joint(
-                    holder, joint, label, ends, frames[parent].inverse() * frames[name]
+        for key, link in links.items():
+            name = names[key]
+            found_links[name] = self._read_link(link.scope, link.local, name, frames[key])
+            if key in joints:
+                joint = joints[key]
+                ends = (names[joint.parent], name)
+                placement = frames[joint.parent].inverse() * frames[key]
+                found_joints[name] = self._read_joint(
+                    joint.scope, joint.element, labels[key], ends, placement
                 )
-            elif name in kinds:
-                found_joints[names[name]] = Joint(
-                    name=f"{names[name]}_{kinds[name]}",
-                    kind=kinds[name],
+            elif key in kinds:
+                found_joints[name] = Joint(
+                    name=f"{name}_{kinds[key]}",
+                    kind=kinds[key],
                     parent=base,
-                    child=names[name],
-                    placement=frames[name],
+                    child=name,
+                    placement=frames[key],
                 )
-        labels = {
-            holder.path + joint.get("name", ""): found_joints[names[child]].name
-            for child, (holder, joint, _) in joints.items()
-        }
-        couplings = list[Coupling]()
-        for coupling in self.couplings:
-            leader = labels.get(coupling.leader or "", coupling.leader)
-            couplings.append(
-                dataclasses.replace(coupling, joint=labels[coupling.joint], leader=leader)
-            )
+        couplings = self._rename_couplings(joints, labels)
         return Description(
             self.file,
             found_links,
@@ -328,8 +362,8 @@ class _Reader:
 
     def _connect(
         self,
-        links: Mapping[str, tuple[Scope, str]],
-        joints: Mapping[str, tuple[Scope, ElementTree.Element, str]],
+        links: Mapping[str, _SdfLink],
+        joints: Mapping[str, _SdfJoint],
         roots: Mapping[str, str],
     ) -> dict[str, str]:
         """Return how each root that no joint connects is held in the world.
@@ -337,40 +371,87 @@ class _Reader:
         Values are "fixed" and "floating". If the only root is to be the description's, there are
         none.
         """
-        loose = [name for name in dict.fromkeys(roots.values()) if name != BASE]
-        is_connected = BASE in roots
-        if not self.is_world and len(loose) + is_connected == 1:
+        distinct = list(dict.fromkeys(roots.values()))
+        if not self.is_world and len(distinct) == 1:
             return {}
-        static = {roots[link] for link, (scope, _) in links.items() if scope.is_static}
-        moving = {
-            roots[child]
-            for child, (scope, joint, _) in joints.items()
-            if self._read_kind(scope, joint) in _MOVING
-        }
+        loose = [name for name in distinct if name != BASE]
+        static = {roots[key] for key, link in links.items() if link.scope.is_static}
+        moving = set[str]()
+        for child, joint in joints.items():
+            if self._read_kind(joint.scope, joint.element) in MOVING_KINDS:
+                moving.add(roots[child])
         fixed = [name for name in loose if name in moving - static]
         if fixed:
-            labels = [links[name][0].path.removesuffix("::") or name for name in fixed]
+            labels = [links[name].scope.path.removesuffix("::") or name for name in fixed]
             about = "not static, but with joints, hence fixed in place"
             self.notes.append(f"{about}: {', '.join(labels)}")
         return {name: "fixed" if name in static | moving else "floating" for name in loose}
 
     def _choose_names(
-        self, links: Mapping[str, tuple[Scope, str]], kinds: Mapping[str, str]
+        self, links: Mapping[str, _SdfLink], kinds: Mapping[str, str]
     ) -> dict[str, str]:
         """Return names of links; the only root of a model in a world is called like the model."""
-        models = Counter(links[name][0].path for name in kinds)
-        names = {name: name for name in links}
-        for name in kinds:
-            path = links[name][0].path
-            if path and models[path] == 1 and path.removesuffix("::") not in links:
-                names[name] = path.removesuffix("::")
+        models = Counter(links[key].scope.path for key in kinds)
+        names = {key: key for key in links}
+        for key in kinds:
+            path = links[key].scope.path
+            model = path.removesuffix("::")
+            if path and models[path] == 1 and model not in links:
+                names[key] = model
         base = WORLD
         while base in names.values():
             base += "_"
-        return {**names, BASE: base}
+        names[BASE] = base
+        return names
+
+    def _choose_joint_names(self, joints: Mapping[str, _SdfJoint]) -> dict[str, str]:
+        """Return the names of joints by their child links, full ones where models share a name."""
+        counts = Counter(joint.name for joint in joints.values())
+        names = dict[str, str]()
+        for child, joint in joints.items():
+            is_unique = counts[joint.name] == 1
+            names[child] = joint.name if is_unique else joint.scope.path + joint.name
+        return names
+
+    def _place_links(
+        self,
+        links: Mapping[str, _SdfLink],
+        joints: Mapping[str, _SdfJoint],
+        kinds: Mapping[str, str],
+    ) -> dict[str, pin.SE3]:
+        """Return the frames of links in the world.
+
+        They are moved to the links' joints, so that axes pass through origins.
+        """
+        frames = {BASE: pin.SE3.Identity()}
+        for key, link in links.items():
+            if key in joints:
+                joint = joints[key]
+                pose = joint.scope.find_joint_pose(joint.element)
+                frames[key] = joint.scope.find_placement() * pose
+            elif key in kinds:
+                frames[key] = link.scope.find_placement(link.local)
+            else:
+                frames[key] = pin.SE3.Identity()
+        return frames
+
+    def _rename_couplings(
+        self, joints: Mapping[str, _SdfJoint], labels: Mapping[str, str]
+    ) -> list[Coupling]:
+        """Return the couplings with the names of joints in the description."""
+        names = {joint.scope.path + joint.name: labels[child] for child, joint in joints.items()}
+        couplings = list[Coupling]()
+        for coupling in self.couplings:
+            leader = names.get(coupling.leader or "", coupling.leader)
+            couplings.append(
+                dataclasses.replace(coupling, joint=names[coupling.joint], leader=leader)
+            )
+        return couplings
+
+    # Joints
 
     def _read_kind(self, scope: Scope, joint: ElementTree.Element) -> str:
-        kind, name = joint.get("type", "").strip(), joint.get("name")
+        kind = joint.get("type", "").strip()
         if kind not in _JOINT_TYPES:
             raise UnknownNameError(
                 "joint type",
@@ -378,7 +459,7 @@ class _Reader:
                 _JOINT_TYPES,
                 file=scope.file,
                 line=find_line(joint),
-                field=name,
+                field=joint.get("name"),
             )
         return kind
 
@@ -391,28 +472,37 @@ class _Reader:
         placement: pin.SE3,
     ) -> Joint:
         kind = self._read_kind(scope, joint)
-        if kind not in ("fixed", *_MOVING):
+        if kind not in ("fixed", *MOVING_KINDS):
             self.notes.append(f"joint '{name}' is {kind}: taken as fixed")
             kind = "fixed"
-        axis, limits, settings = np.array([0.0, 0.0, 1.0]), None, dict[str, Any]()
+        parent, child = ends
         element = joint.find("axis")
-        if element is not None and kind != "fixed":
-            axis = self._read_axis(scope, joint, element)
-            limits, velocity, effort = self._read_limits(scope, element, name)
-            settings |= {"velocity": velocity, "effort": effort}
-            settings |= self._read_dynamics(scope, element, name)
-            mimic = element.find("mimic")
-            if mimic is not None:
-                self.couplings.append(self._read_mimic(scope, joint, mimic))
+        if element is None or kind == "fixed":
+            return Joint(
+                name=name,
+                kind=kind,
+                parent=parent,
+                child=child,
+                placement=placement,
+                axis=np.array([0.0, 0.0, 1.0]),
+            )
+        axis = self._read_axis(scope, joint, element)
+        limits, velocity, effort = self._read_limits(scope, element, name)
+        dynamics = self._read_dynamics(scope, element, name)
+        mimic = element.find("mimic")
+        if mimic is not None:
+            self.couplings.append(self._read_mimic(scope, joint, mimic))
         return Joint(
             name=name,
             kind=kind,
-            parent=ends[0],
-            child=ends[1],
+            parent=parent,
+            child=child,
             placement=placement,
             axis=axis,
             limits=None if kind == "continuous" else limits,
-            **settings,
+            velocity=velocity,
+            effort=effort,
+            **dynamics,
         )
 
     def _read_mimic(
@@ -431,20 +521,27 @@ class _Reader:
         self, scope: Scope, joint: ElementTree.Element, element: ElementTree.Element
     ) -> Any:
         """Return the unit axis in the joint's frame, shape (3,)."""
-        name, xyz = joint.get("name", ""), element.find("xyz")
+        name = joint.get("name", "")
+        xyz = element.find("xyz")
         axis = np.array(scope.read_numbers(element, "xyz", 3, "0 0 1", name))
         if not np.linalg.norm(axis) > 0.0:
-            problem, got = "an axis without direction", (element.findtext("xyz") or "").strip()
-            field_ = f"{name}: axis xyz"
-            raise make_element_error(scope.file, element, problem, field=field_, got=got)
+            raise make_element_error(
+                scope.file,
+                element,
+                "an axis without direction",
+                field=f"{name}: axis xyz",
+                got=(element.findtext("xyz") or "").strip(),
+            )
         own = scope.find_joint_pose(joint)
+        # The frame in which the numbers are: one that is named, the model's, or the joint's.
         stated = "" if xyz is None else xyz.get("expressed_in", "").strip()
+        axis_frame = scope.rules.axis_frame
+        in_model = axis_frame is None
+        if axis_frame == "use_parent_model_frame":
+            in_model = is_true(element.findtext(axis_frame) or "")
         if stated:
             frame = scope.find_pose(stated)
-        elif scope.rules.axis_frame is None or (
-            scope.rules.axis_frame == "use_parent_model_frame"
-            and is_true(element.findtext("use_parent_model_frame") or "")
-        ):
+        elif in_model:
             frame = scope.find_pose("__model__")
         else:
             frame = own
@@ -458,54 +555,58 @@ class _Reader:
         limit = element.find("limit")
         if limit is None:
             return make_limits(-math.inf, math.inf), None, None
-        low, high, velocity, effort = (
-            scope.read_numbers(limit, key, 1, default, name, largest=math.inf, is_finite=False)[0]
+        numbers = {
+            key: _read_any_number(scope, limit, key, default, name)
             for key, default in _LIMITS.items()
-        )
+        }
+        low = numbers["lower"]
+        high = numbers["upper"]
         if low > high:
             ends = f"{low:g} and {high:g}"
             self.notes.append(
                 f"joint '{name}' has a lower limit above its upper limit, {ends}: swapped"
             )
             low, high = high, low
-        rates = [
-            rate if MIN_POSITIVE <= rate < MAX_COORDINATE else None for rate in (velocity, effort)
-        ]
-        return make_limits(low, high), rates[0], rates[1]
+        velocity = _read_rate_limit(numbers["velocity"])
+        effort = _read_rate_limit(numbers["effort"])
+        return make_limits(low, high), velocity, effort
 
     def _read_dynamics(
         self, scope: Scope, element: ElementTree.Element, name: str
-    ) -> dict[str, float]:
-        if (dynamics := element.find("dynamics")) is None:
+    ) -> dict[str, Any]:
+        """Return resistances and spring of an axis by the names of attributes of `Joint`."""
+        dynamics = element.find("dynamics")
+        if dynamics is None:
             return {}
-        damping, friction, stiffness, rest = (
-            scope.read_numbers(dynamics, key, 1, "0", name, largest=math.inf, is_finite=False)[0]
-            for key in ("damping", "friction", "spring_stiffness", "spring_reference")
-        )
         return {
-            "damping": damping,
-            "friction": friction,
-            "stiffness": stiffness,
-            "springref": rest,
+            "damping": _read_any_number(scope, dynamics, "damping", "0", name),
+            "friction": _read_any_number(scope, dynamics, "friction", "0", name),
+            "stiffness": _read_any_number(scope, dynamics, "spring_stiffness", "0", name),
+            "springref": _read_any_number(scope, dynamics, "spring_reference", "0", name),
         }
+
+    # Links
 
     def _read_link(self, scope: Scope, local: str, name: str, frame: pin.SE3) -> Link:
         element = scope.links[local]
         # Places elements in the link's new frame.
         base = frame.inverse() * scope.find_placement()
-        lost: dict[str, list[InputError]] = {"visual": [], "collision": []}
-        visual, collision = (
-            tuple(self._read_shapes(scope, element, kind, base, local, errors))
-            for kind, errors in lost.items()
+        lost_visual = list[InputError]()
+        lost_collision = list[InputError]()
+        visual = tuple(self._read_shapes(scope, element, "visual", base, local, lost_visual))
+        collision = tuple(
+            self._read_shapes(scope, element, "collision", base, local, lost_collision)
         )
         inertia = self._read_inertia(scope, element, base, local, collision)
-        if lost["collision"] and visual:
-            collision, about = (), "its visual shapes collide instead"
-            self.notes += [f"link '{local}': {error}: {about}" for error in lost["collision"]]
-        elif lost["collision"] or (lost["visual"] and not visual and not collision):
-            lost_kind = "collision" if lost["collision"] else "visual"
-            self.missing += [MissingMesh(name, lost_kind, error) for error in lost[lost_kind]]
-        self.notes += [f"link '{local}': {error}: left out" for error in lost["visual"]]
+        if lost_collision and visual:
+            collision = ()
+            about = "its visual shapes collide instead"
+            self.notes += [f"link '{local}': {error}: {about}" for error in lost_collision]
+        elif lost_collision:
+            self.missing += [MissingMesh(name, "collision", error) for error in lost_collision]
+        elif not visual and not collision:
+            self.missing += [MissingMesh(name, "visual", error) for error in lost_visual]
+        self.notes += [f"link '{local}': {error}: left out" for error in lost_visual]
         return Link(name, visual, collision, inertia)
 
     def _read_shapes(
@@ -519,50 +620,38 @@ class _Reader:
     ) -> Iterator[Part]:
         """Yield the shapes of a link, and add errors about missing meshes to `lost`."""
         for element in link.findall(kind):
-            name, geometry = element.get("name", ""), element.find("geometry")
-            shape = next(iter(geometry), None) if geometry is not None else None
+            name = element.get("name", "")
+            geometry = element.find("geometry")
+            shape = None if geometry is None else geometry.find("*")
             if shape is None or shape.tag not in (*_SHAPES, "mesh"):
                 content = "empty" if shape is None else shape.tag
                 self.notes.append(f"{kind} '{name}' of link '{local}' is {content}: left out")
                 continue
             file = None
             if shape.tag == "mesh":
-                uri, line = (shape.findtext("uri") or "").strip(), find_line(shape)
+                uri = (shape.findtext("uri") or "").strip()
                 try:
-                    file = find_mesh_file(uri, scope.file, self.packages, line=line)
+                    file = find_mesh_file(uri, scope.file, self.packages, line=find_line(shape))
                 except InputError as error:
                     lost.append(error)
                     continue
-            yield Part(
-                name=name,
-                placement=base * scope.read_pose(element, local),
-                colour=self._read_colour(scope, element, name),
-                **self._read_geometry(scope, shape, name, file),
-            )
+            placement = base * scope.read_pose(element, local)
+            colour = self._read_colour(scope, element, name)
+            form = self._read_geometry(scope, shape, name, file)
+            yield Part(name=name, placement=placement, colour=colour, **form)
 
     def _read_geometry(
         self, scope: Scope, shape: ElementTree.Element, name: str, file: Path | None
     ) -> dict[str, Any]:
-        """Return kind, size, file and triangles of a shape."""
+        """Return kind, size, file and triangles of a shape, as attributes of `Part`."""
         if file is not None:
-            if file.suffix.lower() in GLTF_SUFFIXES:
-                turned = "is turned from y up, as glTF specifies, to z up, unlike in Gazebo"
-                self.notes.append(f"{file.name} {turned}")
-            size = scope.read_numbers(shape, "scale", 3, "1 1 1", name)
-            part = shape.find("submesh")
-            if part is None:
-                return {"kind": "mesh", "size": size, "file": file}
-            mesh = load_mesh(file, submesh=(part.findtext("name") or "").strip())
-            if is_true(part.findtext("center") or ""):
-                mesh.apply_translation(-mesh.bounds.mean(axis=0))
-            return {"kind": "mesh", "size": size, "triangles": mesh}
-        size = tuple(
-            value
-            for key, count in _SHAPES[shape.tag]
-            for value in scope.read_numbers(shape, key, count, None, name)
-        )
+            return self._read_mesh(scope, shape, name, file)
+        size = tuple[float, ...]()
+        for key, count in _SHAPES[shape.tag]:
+            size += scope.read_numbers(shape, key, count, None, name)
         if min(size) <= 0.0:
-            problem, expected = "a shape without volume", "sizes above 0"
+            problem = "a shape without volume"
+            expected = "sizes above 0"
             raise make_element_error(
                 scope.file, shape, problem, field=name, expected=expected, got=size
             )
@@ -578,6 +667,22 @@ class _Reader:
             ball = trimesh.creation.icosphere(subdivisions=3)
             return {"kind": "mesh", "size": size, "triangles": ball}
         return {"kind": shape.tag, "size": size}
+
+    def _read_mesh(
+        self, scope: Scope, shape: ElementTree.Element, name: str, file: Path
+    ) -> dict[str, Any]:
+        """Return kind, scale, and file or triangles of a <mesh>, as attributes of `Part`."""
+        if file.suffix.lower() in GLTF_SUFFIXES:
+            turned = "is turned from y up, as glTF specifies, to z up, unlike in Gazebo"
+            self.notes.append(f"{file.name} {turned}")
+        size = scope.read_numbers(shape, "scale", 3, "1 1 1", name)
+        part = shape.find("submesh")
+        if part is None:
+            return {"kind": "mesh", "size": size, "file": file}
+        mesh = load_mesh(file, submesh=(part.findtext("name") or "").strip())
+        if is_true(part.findtext("center") or ""):
+            mesh.apply_translation(-mesh.bounds.mean(axis=0))
+        return {"kind": "mesh", "size": size, "triangles": mesh}
 
     def _read_inertia(
         self,
@@ -603,11 +708,11 @@ class _Reader:
                 moments = ElementTree.Element("inertia")
                 stated = f"states no <inertia>: {_MOMENT:g} kg·m² about each axis, as in Gazebo"
                 self.notes.append(f"link '{local}': its <inertial> {stated}")
-            entries = [
-                scope.read_numbers(moments, key, 1, f"{_MOMENT if key in _DIAGONAL else 0}", local)
-                for key in MOMENTS
-            ]
-            values = (value for (value,) in entries)
+            values = list[float]()
+            for key in MOMENTS:
+                default = _MOMENT if key in _DIAGONAL else 0
+                (value,) = scope.read_numbers(moments, key, 1, f"{default}", local)
+                values.append(value)
             return make_inertia(mass, values, base * scope.read_pose(element, local))
         except InputError as error:
             self.notes.append(f"link '{local}': {error}: its <inertial> counts as none")
@@ -647,28 +752,45 @@ class _Reader:
             total = pin.Inertia(mass, total.lever, tensor)
         return total
 
-    def _read_colour(
-        self, scope: Scope, element: ElementTree.Element, name: str
-    ) -> tuple[float, float, float, float] | None:
+    def _read_colour(self, scope: Scope, element: ElementTree.Element, name: str) -> Colour | None:
         material = element.find("material")
         if material is None or material.find("diffuse") is None:
             return None
         rgba = (material.findtext("diffuse") or "").split()
         values = scope.read_numbers(material, "diffuse", len(rgba), "", name)
-        red, green, blue, opacity = (*values, 1.0)[:4] if len(values) >= 3 else (0.8, 0.8, 0.8, 1.0)
+        if len(values) < 3:
+            return _GREY
+        # The opacity may be left out.
+        red, green, blue, opacity = (*values, 1.0)[:4]
         return red, green, blue, opacity
+
+
+def _read_any_number(
+    scope: Scope, element: ElementTree.Element, key: str, default: str, where: str
+) -> float:
+    """Return the number of a child element, which may be infinite."""
+    (value,) = scope.read_numbers(
+        element, key, 1, default, where, largest=math.inf, is_finite=False
+    )
+    return value
+
+
+def _read_rate_limit(stated: float) -> float | None:
+    """Return a velocity or effort limit, or None for numbers that mean none."""
+    return stated if MIN_POSITIVE <= stated < MAX_COORDINATE else None
 
 
 def _note_other_versions(
     file: Path, root: ElementTree.Element, rules: Rules, version: int
 ) -> Iterator[str]:
     """Yield a note about each setting that another version has, and that would matter there."""
+    # Up to 1.4 axes are in the model's frame, from 1.7 on in the joint's.
+    is_in_model = rules.axis_frame is None
     for element in root.iter():
         name = None
         if element.tag == "use_parent_model_frame" and rules.axis_frame != element.tag:
-            # Up to 1.4 axes are in the model's frame, from 1.7 on in the joint's.
-            is_other = is_true(element.text or "") == (rules.axis_frame is not None)
-            name = f"<{element.tag}>" if is_other else None
+            if is_true(element.text or "") != is_in_model:
+                name = f"<{element.tag}>"
         elif element.tag == "pose" and rules.pose_frame != "frame" and element.get("frame"):
             name = "`frame` of <pose>"
         if name is not None:
@@ -683,17 +805,9 @@ def _find_model(file: Path, include: ElementTree.Element, packages: Mapping[str,
     for candidate in candidates:
         if is_file(candidate):
             return candidate
-        if is_file(candidate / "model.config"):
-            config = candidate / "model.config"
-            root = parse_xml(read_text(config, "model.config"), config)
-            stated = {
-                int(match[1]): (element.text or "").strip()
-                for element in root.findall("sdf")
-                if (match := re.match(r"\s*1\.(\d{1,3})", element.get("version", "1.0")))
-            }
-            known = [version for version in stated if version <= _NEWEST] or list(stated)
-            if known and is_file(candidate / stated[max(known)]):
-                return candidate / stated[max(known)]
+        configured = _find_configured_file(candidate)
+        if configured is not None:
+            return configured
         if is_file(candidate / "model.sdf"):
             return candidate / "model.sdf"
     raise make_element_error(
@@ -704,3 +818,21 @@ def _find_model(file: Path, include: ElementTree.Element, packages: Mapping[str,
         expected="a folder with a model.sdf around the file or in GZ_SIM_RESOURCE_PATH",
         got=uri or "none",
     )
+
+
+def _find_configured_file(folder: Path) -> Path | None:
+    """Return the newest SDF file that is read of those that a folder's model.config lists."""
+    config = folder / "model.config"
+    if not is_file(config):
+        return None
+    root = parse_xml(read_text(config, "model.config"), config)
+    files = dict[int, str]()  # by their minor version
+    for element in root.findall("sdf"):
+        match = re.match(r"\s*1\.(\d{1,3})", element.get("version", "1.0"))
+        if match is not None:
+            files[int(match[1])] = (element.text or "").strip()
+    versions = [version for version in files if version <= _NEWEST] or list(files)
+    if not versions:
+        return None
+    newest = folder / files[max(versions)]
+    return newest if is_file(newest) else None

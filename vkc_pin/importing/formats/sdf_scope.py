@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,8 @@ WORLD = "world"
 """Name of the world in SDF."""
 BASE = "\0world"
 """The world among links: links of old files may be called "world"."""
+# Position and rotation of an empty <pose>, by its `rotation_format`
+_IDENTITIES = {"euler_rpy": "0 0 0 0 0 0", "quat_xyzw": "0 0 0 0 0 0 1"}
 
 
 @dataclass(frozen=True)
@@ -81,15 +83,16 @@ class Scope:
     @property
     def is_static(self) -> bool:
         """Whether the model, or one around it, is static."""
-        stated = self._find_setting("static", "0")
-        return is_true(stated) or (self.above is not None and self.above.is_static)
+        if is_true(self._find_setting("static")):
+            return True
+        return self.above is not None and self.above.is_static
 
-    def _find_setting(self, name: str, default: str) -> str:
-        """Return the text of an element of the <include> or else of the model."""
-        for element in (self.include, self.element):
-            if element is not None and (text := (element.findtext(name) or "").strip()):
-                return text
-        return default
+    def _find_setting(self, name: str) -> str:
+        """Return the text of an element of the <include>, else of the model, else nothing."""
+        text = ""
+        if self.include is not None:
+            text = (self.include.findtext(name) or "").strip()
+        return text or (self.element.findtext(name) or "").strip()
 
     def walk(self) -> Iterator[Scope]:
         """Yield this model and all inside it."""
@@ -104,28 +107,32 @@ class Scope:
         return self.above.find_placement() * self._find_own_pose() * self.find_pose(name)
 
     def _find_own_pose(self) -> pin.SE3:
-        """Return the frame of this model in that of the model or world around it."""
-        if self.above is None:
+        """Return the frame of this model in that of the model or world around it.
+
+        The <pose> is that of the frame F that `placement_frame` names, the model's own if there is
+        none. With the model's frame M and the one around it W, ^W T_M = ^W T_F (^M T_F)⁻¹.
+        """
+        above = self.above
+        if above is None:
             return pin.SE3.Identity()
-        with_pose = self.element
-        if self.include is not None and self.include.find("pose") is not None:
-            with_pose = self.include
         if self._own_pose is None:
+            with_pose = self.element
+            if self.include is not None and self.include.find("pose") is not None:
+                with_pose = self.include
             placed = self.element.get("placement_frame", "")
             placed = (with_pose.findtext("placement_frame") or placed).strip()
-            above = self.above
             given = self._resolve("pose of the model", lambda: above.read_pose(with_pose, ""))
             self._own_pose = given * self.find_pose(placed).inverse()
         return self._own_pose
 
-    def _resolve(self, name: str, compute: Any) -> Any:
+    def _resolve(self, name: str, compute: Callable[[], Any]) -> Any:
         """Return the result of a function for a name, unless it leads back to the name."""
         key = (id(self), name)
         if key in self.active:
-            cycle = [other for _, other in [*self.active[self.active.index(key) :], key]]
-            raise InputError(
-                "frames form a cycle", file=self.file, field=name, got=" → ".join(cycle)
-            )
+            first = self.active.index(key)
+            cycle = [other for _, other in self.active[first:]]
+            got = " → ".join([*cycle, name])
+            raise InputError("frames form a cycle", file=self.file, field=name, got=got)
         self.active.append(key)
         try:
             return compute()
@@ -148,7 +155,8 @@ class Scope:
             return self.read_pose(frame, frame.get("attached_to", "").strip())
         if name in self.joints:
             return self.find_joint_pose(self.joints[name])
-        if (inner := self._find_inner(name)) is not None:
+        inner = self._find_inner(name)
+        if inner is not None:
             scope, rest = inner
             return scope._find_own_pose() * scope.find_pose(rest)
         if name == WORLD:
@@ -160,7 +168,10 @@ class Scope:
         first, _, rest = name.partition("::")
         if first in self.models:
             return self.models[first], rest
-        return next(((item, name) for item in self.merged if item.defines(name)), None)
+        for scope in self.merged:
+            if scope.defines(name):
+                return scope, name
+        return None
 
     def defines(self, name: str) -> bool:
         """Return whether the name is one of an element of this model."""
@@ -172,8 +183,10 @@ class Scope:
         )
 
     def _list_names(self) -> list[str]:
-        own = [*self.links, *self.frames, *self.joints, *self.models]
-        return own + [name for scope in self.merged for name in scope._list_names()]
+        names = [*self.links, *self.frames, *self.joints, *self.models]
+        for scope in self.merged:
+            names += scope._list_names()
+        return names
 
     def find_joint_pose(self, joint: ElementTree.Element) -> pin.SE3:
         """Return the frame of a joint in the frame of this model."""
@@ -181,28 +194,36 @@ class Scope:
 
     def read_pose(self, element: ElementTree.Element, default_frame: str) -> pin.SE3:
         """Return the <pose> of an element in the frame of this model."""
-        pose, where = element.find("pose"), element.get("name", element.tag)
+        pose = element.find("pose")
+        where = element.get("name", element.tag)
         if pose is None:
             return self.find_pose(default_frame)
         stated = pose.get("relative_to") or pose.get(self.rules.pose_frame) or default_frame
         form = pose.get("rotation_format", "euler_rpy").strip()
-        is_degrees = is_true(pose.get("degrees", "false"))
-        counts = {"euler_rpy": 6, "quat_xyzw": 7}
-        if form not in counts:
+        if form not in _IDENTITIES:
             raise UnknownNameError(
-                "rotation_format", form, counts, file=self.file, line=find_line(pose), field=where
+                "rotation_format",
+                form,
+                _IDENTITIES,
+                file=self.file,
+                line=find_line(pose),
+                field=where,
             )
-        default = "0 0 0 0 0 0" if form == "euler_rpy" else "0 0 0 0 0 0 1"
-        values = self._parse(pose, pose.text, counts[form], default, f"{where}: pose")
+        default = _IDENTITIES[form]
+        count = len(default.split())
+        values = self._parse(pose, pose.text, count, default, f"{where}: pose")
+        position = np.array(values[:3])
+        turn = np.array(values[3:])
+        is_degrees = is_true(pose.get("degrees", "false"))
         if form == "euler_rpy":
-            angles = np.radians(values[3:]) if is_degrees else np.array(values[3:])
+            angles = np.radians(turn) if is_degrees else turn
             rotation = pin.rpy.rpyToMatrix(*angles)
-        elif is_degrees or not np.linalg.norm(values[3:]) > 0.0:
+        elif is_degrees or not np.linalg.norm(turn) > 0.0:
             problem = "a quaternion in degrees" if is_degrees else "a quaternion of length 0"
             raise make_element_error(self.file, pose, problem, field=where, got=pose.text)
         else:
-            rotation = pin.Quaternion(np.array(values[3:])).normalized().matrix()
-        return self.find_pose(stated.strip()) * pin.SE3(rotation, np.array(values[:3]))
+            rotation = pin.Quaternion(turn).normalized().matrix()
+        return self.find_pose(stated.strip()) * pin.SE3(rotation, position)
 
     def find_link(self, name: str) -> str:
         """Return the name, in the description, of the link that a frame is attached to."""
@@ -217,14 +238,17 @@ class Scope:
             return self.find_link(self.frames[name].get("attached_to", "").strip())
         if name in self.joints:
             return self.find_link(self.read_end(self.joints[name], "child"))
-        if (inner := self._find_inner(name)) is not None:
-            return inner[0].find_link(inner[1])
+        inner = self._find_inner(name)
+        if inner is not None:
+            scope, rest = inner
+            return scope.find_link(rest)
         if name == WORLD:
             return BASE
         names = [*self._list_names(), WORLD]
         raise UnknownNameError("link", name, names, file=self.file, field=self.element.get("name"))
 
     def _find_canonical_link(self) -> str:
+        """Return the link of this model that its frame is attached to, by default the first."""
         if self.above is None:
             return BASE
         stated = self.element.get("canonical_link", "").strip()
@@ -232,17 +256,20 @@ class Scope:
             return self.find_link(stated)
         if self.links:
             return self.path + next(iter(self.links))
-        for scope in (*self.models.values(), *self.merged):
-            return scope.find_link("")
-        problem = "a model without links"
-        raise make_element_error(self.file, self.element, problem, field=self.element.get("name"))
+        inner = [*self.models.values(), *self.merged]
+        if not inner:
+            problem = "a model without links"
+            name = self.element.get("name")
+            raise make_element_error(self.file, self.element, problem, field=name)
+        return inner[0].find_link("")
 
     def read_end(self, joint: ElementTree.Element, key: str) -> str:
         """Return the frame that a joint names as its "parent" or "child"."""
-        if not (name := (joint.findtext(key) or "").strip()):
-            problem, expected = "a joint that connects nothing", f"<{key}>"
-            name = joint.get("name", "")
-            raise make_element_error(self.file, joint, problem, field=name, expected=expected)
+        name = (joint.findtext(key) or "").strip()
+        if not name:
+            problem = "a joint that connects nothing"
+            where = joint.get("name", "")
+            raise make_element_error(self.file, joint, problem, field=where, expected=f"<{key}>")
         return name
 
     def read_numbers(
@@ -274,8 +301,10 @@ class Scope:
         *,
         is_finite: bool = True,
     ) -> tuple[float, ...]:
-        text = text if text is None or text.strip() else None  # an empty element is a default
-        holder = ElementTree.Element(element.tag, {} if text is None else {"text": text})
+        holder = ElementTree.Element(element.tag)
+        # An empty element means the default.
+        if text is not None and text.strip():
+            holder.set("text", text)
         try:
             return parse_numbers(
                 self.file,

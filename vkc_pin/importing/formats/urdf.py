@@ -12,6 +12,7 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError
 from vkc_pin.importing.description import (
+    MOVING_KINDS,
     Coupling,
     Description,
     Joint,
@@ -33,7 +34,6 @@ from vkc_pin.world.files.xml import read_xml
 
 _READ = ("link", "joint", "material")
 """Elements of a URDF; others belong to simulators and controllers."""
-_MOVING = ("revolute", "continuous", "prismatic")
 
 
 def read_urdf_description(
@@ -181,7 +181,7 @@ class _Reader:
         name = element.get("name", "")
         direction = np.array([1.0, 0.0, 0.0])
         axis = element.find("axis")
-        if axis is not None and kind in _MOVING:
+        if axis is not None and kind in MOVING_KINDS:
             stated = parse_numbers(self._file, axis, "xyz", 3, default="1 0 0", where=name)
             direction = np.array(stated)
         velocity = 0.0

@@ -31,15 +31,23 @@ _ARGUMENTS = (
 
 
 def uses_xacro(root: ElementTree.Element, file: Path) -> bool:
-    """Return whether xacro must process a file; those that it wrote declare its namespace, too."""
-    return file.suffix == ".xacro" or (
-        "xmlns:xacro" in root.attrib
-        and any(
-            element.tag.startswith("xacro:")
-            or any("$" in text for text in (element.text or "", *element.attrib.values()))
-            for element in root.iter()
-        )
-    )
+    """Return whether xacro must process a file.
+
+    Files that it wrote declare its namespace, too, but have nothing that it would replace.
+    """
+    if file.suffix == ".xacro":
+        return True
+    if "xmlns:xacro" not in root.attrib:
+        return False
+    return any(_is_for_xacro(element) for element in root.iter())
+
+
+def _is_for_xacro(element: ElementTree.Element) -> bool:
+    """Return whether xacro would replace an element, or a text of it such as `$(arg NAME)`."""
+    if element.tag.startswith("xacro:"):
+        return True
+    texts = (element.text or "", *element.attrib.values())
+    return any("$" in text for text in texts)
 
 
 def expand_xacro(file: Path, packages: Mapping[str, Path], arguments: Mapping[str, str]) -> str:
@@ -64,10 +72,13 @@ def expand_xacro(file: Path, packages: Mapping[str, Path], arguments: Mapping[st
 def _expand_xacro(
     path: Path, file: Path, packages: Mapping[str, Path], arguments: Mapping[str, str]
 ) -> str:
+    """Return the URDF of the xacro file at an absolute `path`; messages name `file`."""
     import xacro
     from xacro import substitution_args
 
-    messages, known = io.StringIO(), len(xacro.all_includes)
+    messages = io.StringIO()
+    # xacro lists the files that it includes in a global variable, never emptied.
+    known = len(xacro.all_includes)
     try:
         with (
             _search_packages(substitution_args, path, packages),
@@ -77,21 +88,34 @@ def _expand_xacro(
             expanded = str(document.toprettyxml(indent="  "))
     except MemoryError:
         raise
-    except (Exception, SystemExit) as error:  # macros, expressions and XML raise any type
-        cause: Any = error
-        while isinstance(getattr(cause, "exc", None), BaseException):
-            cause = cause.exc
-        if isinstance(cause, MemoryError):  # of an expression
+    # Macros, expressions and XML raise any type.
+    except (Exception, SystemExit) as error:
+        cause = _find_cause(error)
+        # An expression may have needed the memory.
+        if isinstance(cause, MemoryError):
             raise MemoryError from error
         files = [path, *map(Path, xacro.all_includes[known:])]
         _check_packages(files, path, file, packages)
-        if isinstance(cause, (substitution_args.ArgException, KeyError)):  # one that is not given
+        # So an argument fails that is not given.
+        if isinstance(cause, (substitution_args.ArgException, KeyError)):
             _check_arguments(files, file, arguments)
-        problem = " ".join((str(error) or messages.getvalue()).split())
-        problem = problem.partition(" [Errno")[0]  # repeats the sentence before
+        message = str(error) or messages.getvalue()
+        problem = " ".join(message.split())
+        # The number of an error repeats the sentence before.
+        problem = problem.partition(" [Errno")[0]
         raise InputError(f"xacro cannot process the file: {problem}", file=file) from error
-    _check_arguments([path, *map(Path, xacro.all_includes[known:])], file, arguments)
+    files = [path, *map(Path, xacro.all_includes[known:])]
+    _check_arguments(files, file, arguments)
     return expanded
+
+
+def _find_cause(error: BaseException) -> BaseException:
+    """Return the error that an error of xacro wraps, if any."""
+    cause: Any = error
+    while isinstance(getattr(cause, "exc", None), BaseException):
+        cause = cause.exc
+    found: BaseException = cause
+    return found
 
 
 @contextlib.contextmanager
@@ -120,8 +144,11 @@ def _check_arguments(files: Iterable[Path], file: Path, arguments: Iterable[str]
 
     xacro itself ignores such arguments. Names that an expression computes may be any.
     """
-    texts = [_COMMENT.sub("", _read_quietly(each)) for each in files]
-    names = {name for text in texts for pattern in _ARGUMENTS for name in pattern.findall(text)}
+    names = set[str]()
+    for each in files:
+        text = _COMMENT.sub("", _read_quietly(each))
+        for pattern in _ARGUMENTS:
+            names.update(pattern.findall(text))
     if any("$" in name for name in names):
         return
     for argument in arguments:
@@ -140,8 +167,11 @@ def _check_packages(
     files: Iterable[Path], path: Path, file: Path, packages: Mapping[str, Path]
 ) -> None:
     """Raise an error that lists all packages in `$(find NAME)` of some files that are missing."""
-    names = dict.fromkeys(name for each in files for name in _FIND.findall(_read_quietly(each)))
-    if missing := [name for name in names if find_package(name, path, packages) is None]:
+    names = dict[str, None]()  # an ordered set
+    for each in files:
+        names |= dict.fromkeys(_FIND.findall(_read_quietly(each)))
+    missing = [name for name in names if find_package(name, path, packages) is None]
+    if missing:
         raise InputError(
             f"packages were not found: {', '.join(missing)}",
             file=file,

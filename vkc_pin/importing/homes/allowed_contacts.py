@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -43,21 +42,16 @@ class HomeContacts:
             return [], ()
         links_by_label = _find_links_of_objects(home)
         moving = set(links_by_label)
-        links_by_label |= {name: {link} for name, link in obstacles.items()}
-        labels_by_link: dict[str, list[str]] = {}
-        for label, links in links_by_label.items():
-            for link in links:
-                labels_by_link.setdefault(link, []).append(label)
-        counts: dict[tuple[str, str], int] = {}
-        for one, other in self.allowed:
-            both = labels_by_link.get(one, ()), labels_by_link.get(other, ())
-            for first, second in itertools.product(*both):
-                pair = (min(first, second), max(first, second))
-                counts[pair] = counts.get(pair, 0) + 1
-        pairs, partial = list[list[str]](), list[str]()
+        for name, link in obstacles.items():
+            links_by_label[name] = {link}
+        counts = self._count_link_pairs(links_by_label)
+        pairs = list[list[str]]()
+        partial = list[str]()
         for (one, other), count in sorted(counts.items()):
-            is_checked = moving & {one, other} and one.split(".")[0] != other.split(".")[0]
-            if not is_checked:
+            # Pairs within an object, and pairs of obstacles, are never checked.
+            is_moving = one in moving or other in moving
+            is_same_object = one.split(".")[0] == other.split(".")[0]
+            if not is_moving or is_same_object:
                 continue
             if count == len(links_by_label[one]) * len(links_by_label[other]):
                 pairs.append([one, other])
@@ -70,6 +64,22 @@ class HomeContacts:
             text = "not in `allow`, as only some of their links may touch"
             notes.append(f"{self._file}: {text}: {format_names(partial)}")
         return pairs, tuple(notes)
+
+    def _count_link_pairs(
+        self, links_by_label: Mapping[str, Collection[str]]
+    ) -> dict[tuple[str, str], int]:
+        """Return the number of allowed pairs of links for each pair of names in the scene."""
+        labels_by_link = dict[str, list[str]]()
+        for label, links in links_by_label.items():
+            for link in links:
+                labels_by_link.setdefault(link, []).append(label)
+        counts = dict[tuple[str, str], int]()
+        for one, other in self.allowed:
+            for first in labels_by_link.get(one, ()):
+                for second in labels_by_link.get(other, ()):
+                    pair = (min(first, second), max(first, second))
+                    counts[pair] = counts.get(pair, 0) + 1
+        return counts
 
 
 def read_home_contacts(
@@ -92,7 +102,8 @@ def read_home_contacts(
     try:
         pairs = read_allowed_pairs(path, [links])
         _check_links(path, pairs, links)
-        handles = [handle.get("name", "") for handle in read_xml(path, "SRDF")[1].iter("handle")]
+        _, root = read_xml(path, "SRDF")
+        handles = [handle.get("name", "") for handle in root.iter("handle")]
     except InputError as error:
         if srdf is not None:
             raise
@@ -122,7 +133,7 @@ def _check_links(path: Path, pairs: AllowedPairs, links: Collection[str]) -> Non
 
 def _find_links_of_objects(home: Home) -> dict[str, set[str]]:
     """Return the links with shapes, by the name in the scene of the link that carries them."""
-    links_by_label: dict[str, set[str]] = {}
+    links_by_label = dict[str, set[str]]()
     for item in home.objects:
         for name, link in item.description.links.items():
             if link.solid:

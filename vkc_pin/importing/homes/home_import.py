@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import re
 import warnings
 from collections.abc import Iterator, Mapping
@@ -31,7 +30,13 @@ from vkc_pin.importing.objects.clean_up import (
 from vkc_pin.importing.objects.object_reading import WEIGHTLESS, read_object
 from vkc_pin.importing.objects.pieces import PieceCache
 from vkc_pin.importing.progress import ImportProgress
-from vkc_pin.importing.scenes import locate_robot, refer_to_robot, write_scene
+from vkc_pin.importing.scenes import (
+    HORIZONTAL,
+    locate_robot,
+    refer_to_robot,
+    round_interval,
+    write_scene,
+)
 from vkc_pin.importing.targets import check_source, check_target
 from vkc_pin.options import Options
 from vkc_pin.planning.base_paths.reachable_floor import CELL, find_free_floor
@@ -46,6 +51,10 @@ from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
 
 _COMMAND = "import-home"
 _LARGEST = 1e3  # [m] largest height of a floor
+_STANDOFF = 0.9  # [m] typical distance of a robot's base from a handle that it grasps
+_RADIUS = 0.5  # [m] around this position within which free floor counts as reaching the handle
+_TRIES = 4000  # sampled poses
+_CHOICE = 12  # free poses of which the one with the largest clearance is chosen
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,15 +92,14 @@ class ImportedHome:
         start = f"start at ({base})"
         if self.objects:
             start += f", with free floor to {self.reached} of these objects"
-        return "\n".join(
-            [
-                f"{self.scene.name}: {size}, {counts}",
-                f"  {self.shapes['file']} shapes in the file: {parts}",
-                *(f"  {note}" for note in self.notes),
-                start,
-                *(f"  {item.summary()}" for item in self.objects),
-            ]
-        )
+        lines = [
+            f"{self.scene.name}: {size}, {counts}",
+            f"  {self.shapes['file']} shapes in the file: {parts}",
+        ]
+        lines += [f"  {note}" for note in self.notes]
+        lines.append(start)
+        lines += [f"  {item.summary()}" for item in self.objects]
+        return "\n".join(lines)
 
 
 def import_home(  # noqa: PLR0913 - keyword options of a public call
@@ -139,10 +147,9 @@ def import_home(  # noqa: PLR0913 - keyword options of a public call
     check_integer(most, "most", low=1, high=100)
     rng = np.random.default_rng(check_integer(seed, "seed", low=0))
     options = Options() if options is None else check_instance(options, Options, "options")
-    hand = load_robot(robot)
-    target = (
-        check_path(folder, "folder", "a folder") if folder is not None else Path(_choose_name(path))
-    )
+    loaded_robot = load_robot(robot)
+    name = _choose_name(path)
+    target = Path(name) if folder is None else check_path(folder, "folder", "a folder")
     check_source(path, "a URDF, xacro, MJCF or SDF file")
     check_target(target, _COMMAND, force=check_bool(force, "force"))
     srdf_path = None if srdf is None else check_path(srdf, "srdf")
@@ -157,65 +164,68 @@ def import_home(  # noqa: PLR0913 - keyword options of a public call
     with write_folder_atomically(target, force=True, source=path) as staging:
         cache: PieceCache = {}
         names = [item.name for item in home.objects]
-        taken = {FLOOR, *names}
+        stems = choose_file_names(names)
         clearances = {"dist_safe": options.dist_safe, "grasp_clearance": options.grasp_clearance}
         progress = ImportProgress(measure_parts(home))
-        objects = tuple(
-            write_object(item, hand, staging, cache, stem=stem, most=most, **clearances)
-            for item, stem in zip(
-                progress.follow(home.objects), choose_file_names(names), strict=True
+        objects = list[ImportedHomeObject]()
+        for item, stem in zip(progress.follow(home.objects), stems, strict=True):
+            objects.append(
+                write_object(item, loaded_robot, staging, cache, stem=stem, most=most, **clearances)
             )
-        )
+        taken = {FLOOR, *names}
         obstacles, obstacle_links, obstacle_notes = write_obstacles(
             home, path, staging, taken, cache, progress
         )
         allowed, contact_notes = contacts.find_scene_pairs(home, obstacle_links)
-        bounds, (low, high) = (low, high), add_floor(home, low, high)
+        floor_low, floor_high = add_floor(home, low, high)
+        x, y = (floor_low + floor_high)[:2] / 2.0
+        x_range = round_interval(floor_low[0], floor_high[0])
+        y_range = round_interval(floor_low[1], floor_high[1])
         document: dict[str, Any] = {
-            "name": _choose_name(path),
+            "name": name,
             "robot": locate_robot(robot),
-            "start": {"base": [round(float(value), 3) for value in (*(low + high)[:2] / 2.0, 0.0)]},
-            "arena": {axis: _round_interval(low[k], high[k]) for k, axis in enumerate("xy")},
-            "start_region": {axis: _round_interval(low[k], high[k]) for k, axis in enumerate("xy")},
+            "start": {"base": [round(float(x), 3), round(float(y), 3), 0.0]},
+            "arena": {"x": x_range, "y": y_range},
+            "start_region": {"x": list(x_range), "y": list(y_range)},
             "obstacles": obstacles,
             "objects": [item.entry for item in objects],
-            **({"allow": allowed} if allowed else {}),
         }
+        if allowed:
+            document["allow"] = allowed
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # they are repeated when the scene is loaded
+            # They are repeated when the scene is loaded.
+            warnings.simplefilter("ignore")
             scene, reached = find_free_start(Scene.from_document(document, staging), rng, path)
         document["start"] = {"base": scene.start[:3].tolist()}
         document["robot"] = refer_to_robot(robot, target)
         write_scene(staging / "scene.yaml", path, document, _COMMAND)
-    notes = (
+    notes = [
         *home.notes,
         *_note_movable_parts(home),
         *_note_floor_shapes(home),
-        *_note_open_sides(bounds, (low, high)),
+        *_note_open_sides((low, high), (floor_low, floor_high)),
         *_note_high_objects(scene, rng),
         *contacts.notes,
         *contact_notes,
         *obstacle_notes,
-        *(f"{item.name}: {note}" for item in objects for note in item.notes),
-    )
+    ]
+    for written in objects:
+        notes += [f"{written.name}: {note}" for note in written.notes]
     return ImportedHome(
         target / "scene.yaml",
         load_scene(target / "scene.yaml"),
-        objects,
+        tuple(objects),
         _count_shapes(home),
         reached,
-        notes,
+        tuple(notes),
     )
-
-
-def _round_interval(low: float, high: float) -> list[float]:
-    return [round(float(low), 3), round(float(high), 3)]
 
 
 def _choose_name(path: Path) -> str:
     """Return a name for a home."""
     name = re.sub(r"[^A-Za-z0-9_]+", "_", path.stem).strip("_")
-    return choose_file_names([name], fallback="home")[0]
+    (name,) = choose_file_names([name], fallback="home")
+    return name
 
 
 def _note_movable_parts(home: Home) -> Iterator[str]:
@@ -234,24 +244,24 @@ def _note_floor_shapes(home: Home) -> list[str]:
 
 
 def _note_open_sides(before: tuple[Floats, Floats], after: tuple[Floats, Floats]) -> Iterator[str]:
-    sides = [
-        f"{sign}{name}"
-        for sign, old, new in zip("-+", before, after, strict=True)
-        for name, moved in zip("xy", old != new, strict=False)
-        if moved
-    ]
+    sides = list[str]()
+    for sign, old, new in zip("-+", before, after, strict=True):
+        for axis, moved in zip("xy", old != new, strict=False):
+            if moved:
+                sides.append(f"{sign}{axis}")
     if sides:
         yield f"2 m of floor lie beyond the sides without walls: {', '.join(sides)}"
 
 
 def _note_high_objects(scene: Scene, rng: np.random.Generator) -> Iterator[str]:
     """Note objects whose attachments are all above the hand's reach, as above a wrong floor."""
-    top, high = _compute_reaching_height(scene.robot, rng), list[str]()
+    top = _compute_reaching_height(scene.robot, rng)
+    high = list[str]()
     for name, placed in scene.objects.items():
-        heights = [
-            placed.link_placement(one.link).act(one.placement.translation)[2]
-            for one in placed.object.attachments.values()
-        ]
+        heights = list[float]()
+        for attachment in placed.object.attachments.values():
+            link = placed.link_placement(attachment.link)
+            heights.append(link.act(attachment.placement.translation)[2])
         if heights and min(heights) > top:
             high.append(f"{name} ({min(heights):.1f} m)")
     if high:
@@ -261,10 +271,12 @@ def _note_high_objects(scene: Scene, rng: np.random.Generator) -> Iterator[str]:
 
 def _compute_reaching_height(robot: Robot, rng: np.random.Generator) -> float:
     """Return the largest height of the hand over random configurations of the arm [m]."""
-    data, frame = robot.model.createData(), robot.model.getFrameId(robot.tool_frame)
-    low, high = np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi)
-    heights = []
-    for z in rng.uniform(low, np.maximum(low, high), (_TRIES, len(low))):
+    data = robot.model.createData()
+    frame = robot.model.getFrameId(robot.tool_frame)
+    low = np.maximum(robot.lower, -np.pi)
+    high = np.maximum(low, np.minimum(robot.upper, np.pi))
+    heights = list[float]()
+    for z in rng.uniform(low, high, (_TRIES, len(low))):
         pin.forwardKinematics(robot.model, data, robot.coordinates.q(z))
         heights.append(pin.updateFramePlacement(robot.model, data, frame).translation[2])
     return float(max(heights))
@@ -272,18 +284,15 @@ def _compute_reaching_height(robot: Robot, rng: np.random.Generator) -> float:
 
 def _count_shapes(home: Home) -> dict[str, int]:
     """Return the number of collision shapes by their role."""
-    objects = sum(
-        len(link.solid) for item in home.objects for link in item.description.links.values()
-    )
-    obstacles = sum(len(link.solid) for link in (*home.building, *home.furniture))
-    shapes = {"file": home.shapes, "obstacles": obstacles, "objects": objects}
-    return {**shapes, "floor": len(home.floor)}
-
-
-_STANDOFF = 0.9  # [m] typical distance of a robot's base from a handle that it grasps
-_RADIUS = 0.5  # [m] around this position within which free floor counts as reaching the handle
-_TRIES = 4000  # sampled poses
-_CHOICE = 12  # free poses of which the one with the largest clearance is chosen
+    object_shapes = 0
+    for item in home.objects:
+        object_shapes += sum(len(link.solid) for link in item.description.links.values())
+    return {
+        "file": home.shapes,
+        "obstacles": sum(len(link.solid) for link in (*home.building, *home.furniture)),
+        "objects": object_shapes,
+        "floor": len(home.floor),
+    }
 
 
 def find_free_start(
@@ -296,60 +305,84 @@ def find_free_start(
     """
     from scipy import ndimage
 
-    robot, arena = scene.robot, scene.arena
-    low, high = np.array([arena[0], arena[2]]), np.array([arena[1], arena[3]])
     cells, free = find_free_floor(scene)
+    # Connected cells of free floor have the number of their region, from 1; others have 0.
     regions, count = ndimage.label(free)
     middles = np.stack(np.broadcast_arrays(*cells.centers()), axis=-1)
     reached = np.zeros(count + 1, int)
     for positions in _find_grasp_positions(scene).values():
-        near = np.zeros(cells.shape, bool)
+        is_near = np.zeros(cells.shape, bool)
         for position in positions:
-            near |= np.linalg.norm(middles - position, axis=-1) < _RADIUS
-        reached[np.setdiff1d(regions[near], [0])] += 1
-    order = sorted(range(1, count + 1), key=lambda k: (-reached[k], -int((regions == k).sum())))
+            is_near |= np.linalg.norm(middles - position, axis=-1) < _RADIUS
+        reached[np.setdiff1d(regions[is_near], [0])] += 1
+    sizes = np.bincount(regions.ravel(), minlength=count + 1)
+    # The region that reaches most objects comes first, of equal ones the largest.
+    order = sorted(range(1, count + 1), key=lambda region: (-reached[region], -sizes[region]))
     for region in order:
         places = middles[regions == region]
-        draws = (
-            scene.with_start(base=_sample_pose(places, rng, low, high))
-            for _ in range(_TRIES // len(order) + 1)
-        )
-        free_draws = (
-            (s, c) for s in draws if (c := s.start_clearance(reach=1.0)) >= START_CLEARANCE
-        )
-        found = list(itertools.islice(free_draws, _CHOICE))
-        if found:
-            return max(found, key=lambda entry: entry[1])[0], int(reached[region])
-    problem = f"no start pose of {robot.name} has a clearance of {START_CLEARANCE} m"
-    expected = "a home with free floor for the robot, at the height `floor`"
+        start = _sample_free_start(scene, places, rng, _TRIES // len(order) + 1)
+        if start is not None:
+            return start, int(reached[region])
     raise InputError(
-        problem,
+        f"no start pose of {scene.robot.name} has a clearance of {START_CLEARANCE} m",
         file=file,
         field="robot, floor",
-        expected=expected,
+        expected="a home with free floor for the robot, at the height `floor`",
         got=f"none in {_TRIES} tries",
     )
+
+
+def _sample_free_start(
+    scene: Scene, places: Floats, rng: np.random.Generator, tries: int
+) -> Scene | None:
+    """Return the scene with the clearest of some free start poses in cells, or None.
+
+    Args:
+        scene: The scene.
+        places: Middles of the cells, shape (n, 2) [m].
+        rng: Generator of random poses.
+        tries: Largest number of poses.
+    """
+    x_low, x_high, y_low, y_high = scene.arena
+    low = np.array([x_low, y_low])
+    high = np.array([x_high, y_high])
+    free_count = 0
+    best = None
+    best_clearance = -np.inf
+    for _ in range(tries):
+        drawn = scene.with_start(base=_sample_pose(places, rng, low, high))
+        clearance = drawn.start_clearance(reach=1.0)
+        if clearance < START_CLEARANCE:
+            continue
+        if clearance > best_clearance:
+            best = drawn
+            best_clearance = clearance
+        free_count += 1
+        if free_count == _CHOICE:
+            break
+    return best
 
 
 def _sample_pose(
     places: Floats, rng: np.random.Generator, low: Floats, high: Floats
 ) -> list[float]:
     """Return a random position in one of some cells, and a random heading."""
-    place = places[int(rng.integers(len(places)))] + rng.uniform(-0.5, 0.5, 2) * CELL
-    return [
-        *np.clip(place, low, high).round(3).tolist(),
-        round(float(rng.uniform(-np.pi, np.pi)), 3),
-    ]
+    middle = places[int(rng.integers(len(places)))]
+    position = middle + rng.uniform(-0.5, 0.5, 2) * CELL
+    x, y = np.clip(position, low, high).round(3).tolist()
+    yaw = round(float(rng.uniform(-np.pi, np.pi)), 3)
+    return [x, y, yaw]
 
 
 def _find_grasp_positions(scene: Scene) -> dict[str, list[Floats]]:
     """Return the base positions from which a robot grasps each object, shape (2,) [m] each."""
-    found: dict[str, list[Floats]] = {}
+    found = dict[str, list[Floats]]()
     for name, placed in scene.objects.items():
         for attachment in placed.object.attachments.values():
             tool = placed.link_placement(attachment.link) * attachment.placement
             direction = tool.rotation[:2, 2]
             length = float(np.linalg.norm(direction))
-            back = -direction / length if length > 0.5 else np.zeros(2)
+            # A grasp from above has no direction: the floor below it counts.
+            back = -direction / length if length > HORIZONTAL else np.zeros(2)
             found.setdefault(name, []).append(tool.translation[:2] + _STANDOFF * back)
     return found

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.importing.description import Description, Joint, Link
+from vkc_pin.importing.description import MOVING_KINDS, Description, Link, Part
 from vkc_pin.importing.objects.clean_up import (
-    MOVING,
     collect_attached_links,
     compute_bounds,
     find_closed_positions,
@@ -76,62 +74,96 @@ def split_home(description: Description) -> Home:
     building, each joint starts an object of its own, without fixed shapes: doors may swing past
     walls.
     """
-    description = fix_immovable_joints(description)
-    joints, notes = description.joints, list(description.notes)
-    places, values = description.compute_placements(), find_closed_positions(description)
-    current_placements = description.compute_placements(values)
-    free = [child for child, joint in joints.items() if joint.kind == "floating"]
-    fixed = {description.root}
-    while (
-        added := {
-            child
-            for child, joint in joints.items()
-            if joint.kind == "fixed" and joint.parent in fixed
-        }
-        - fixed
-    ):
-        fixed |= added
-    building, furniture = list[Link](), list[Link]()
-    floor, objects = list[str](), list[HomeObject]()
-    for name in (name for name in description.links if name in fixed):
-        link = description.links[name].transform(places[name])
-        children = [
-            child
-            for child, joint in joints.items()
-            if joint.parent == name and joint.kind in MOVING
-        ]
-        large = name == description.root or _measure_length(link) > _BUILDING
-        if children and not large:
-            attached = (collect_attached_links(description, child) for child in children)
-            part = _extract_links(description, name, {name}.union(*attached))
-            objects.append(_place_object(name, part, places[name]))
-            continue
+    return _Splitter(fix_immovable_joints(description)).split()
+
+
+class _Splitter:
+    """Collects the parts of a home.
+
+    Args:
+        description: The home, with joints that move shapes only.
+    """
+
+    def __init__(self, description: Description) -> None:
+        self._description = description
+        self._children = description.children()
+        self._notes = list(description.notes)
+        self._building = list[Link]()
+        self._furniture = list[Link]()
+        self._floor = list[str]()
+        self._objects = list[HomeObject]()
+
+    def split(self) -> Home:
+        """Return the home, divided into its parts."""
+        description = self._description
+        placements = description.compute_placements()
+        for name in description.links:
+            if description.is_fixed(name):
+                self._add_fixed_link(name, placements[name])
+        closed = find_closed_positions(description)
+        closed_placements = description.compute_placements(closed)
+        for child, joint in description.joints.items():
+            if joint.kind == "floating":
+                self._add_free_object(child, closed_placements[child], closed)
+        return Home(
+            building=tuple(self._building),
+            furniture=tuple(self._furniture),
+            floor=tuple(self._floor),
+            objects=tuple(self._objects),
+            shapes=sum(len(link.solid) for link in description.links.values()),
+            notes=tuple(self._notes),
+        )
+
+    def _add_fixed_link(self, name: str, placement: pin.SE3) -> None:
+        """Add a fixed link as furniture or part of the building, and objects of its joints."""
+        description = self._description
+        link = description.links[name].transform(placement)
+        children = list[str]()
+        for child in self._children.get(name, ()):
+            if description.joints[child].kind in MOVING_KINDS:
+                children.append(child)
+        is_building = name == description.root or _measure_length(link) > _BUILDING
+        if children and not is_building:
+            attached = {name}
+            for child in children:
+                attached |= collect_attached_links(description, child)
+            part = _extract_links(description, name, attached)
+            self._objects.append(_place_object(name, part, placement))
+            return
         for child in children:
             part = _add_empty_base(description, child)
-            objects.append(_place_object(child, part, places[name]))
-        low = [part for part in link.solid if part.make_mesh().bounds[1, 2] <= FLOOR_RISE]
-        floor += [part.name or name for part in low]
-        solid = tuple(part for part in link.solid if not any(part is other for other in low))
+            self._objects.append(_place_object(child, part, placement))
+        solid = list[Part]()
+        for shape in link.solid:
+            if shape.make_mesh().bounds[1, 2] <= FLOOR_RISE:
+                self._floor.append(shape.name or name)
+            else:
+                solid.append(shape)
         if solid:
-            visual = link.visual if not low else ()
-            (building if large else furniture).append(Link(name, visual, solid))
-    for name in free:
-        links_of_object = collect_attached_links(description, name)
-        if not any(description.links[link].solid for link in links_of_object):
-            notes.append(f"link '{name}' is free and has no shape: left out")
-            continue
-        part = _extract_links(description, name, links_of_object)
-        fixed_joints = dict(part.joints)
+            # Visual shapes are not divided into floor and others.
+            has_floor = len(solid) < len(link.solid)
+            visual = () if has_floor else link.visual
+            parts = self._building if is_building else self._furniture
+            parts.append(Link(name, visual, tuple(solid)))
+
+    def _add_free_object(
+        self, name: str, placement: pin.SE3, positions: Mapping[str, float]
+    ) -> None:
+        """Add a free object, whose joints are fixed at `positions`."""
+        description = self._description
+        attached = collect_attached_links(description, name)
+        if not any(description.links[link].solid for link in attached):
+            self._notes.append(f"link '{name}' is free and has no shape: left out")
+            return
+        part = _extract_links(description, name, attached)
+        joints = dict(part.joints)
         for child, joint in part.joints.items():
-            if joint.kind in MOVING:
-                fixed_joints[child] = joint.fix(values.get(joint.name, 0.0))
-                notes.append(f"joint '{joint.name}' belongs to the free object '{name}': fixed")
-        rigid = dataclasses.replace(part, joints=fixed_joints)
-        objects.append(_place_object(name, rigid, current_placements[name], free=True))
-    shapes = sum(len(link.solid) for link in description.links.values())
-    return Home(
-        tuple(building), tuple(furniture), tuple(floor), tuple(objects), shapes, tuple(notes)
-    )
+            if joint.kind in MOVING_KINDS:
+                joints[child] = joint.fix(positions.get(joint.name, 0.0))
+                about = f"belongs to the free object '{name}'"
+                self._notes.append(f"joint '{joint.name}' {about}: fixed")
+        rigid = dataclasses.replace(part, joints=joints)
+        self._objects.append(_place_object(name, rigid, placement, free=True))
 
 
 def add_floor(home: Home, low: Floats, high: Floats) -> tuple[Floats, Floats]:
@@ -145,31 +177,53 @@ def add_floor(home: Home, low: Floats, high: Floats) -> tuple[Floats, Floats]:
         low: Lower corner of its bounding box, shape (3,) [m].
         high: Upper corner of its bounding box, shape (3,) [m].
     """
+    lines, outward = _cut_walls(home)
+    size = high - low
+    beyond = np.zeros((2, 3))
+    for axis in (0, 1):
+        depth = min(_WALL_DEPTH, 0.5 * float(size[axis]))
+        other_axis = 1 - axis
+        # Of each side: its number, a corner on it, and the sign of the direction inwards
+        for side, corner, inward in ((0, low, 1.0), (1, high, -1.0)):
+            distance = np.abs(lines[:, :, axis] - corner[axis]).max(axis=1)
+            faces_inside = inward * outward[:, axis] >= 0.0
+            is_wall = faces_inside & (distance < depth)
+            along = np.sort(lines[is_wall][:, :, other_axis], axis=1)
+            if _measure_union(along) < 0.5 * size[other_axis]:
+                beyond[side, axis] = _FLOOR_BEYOND
+    return low - beyond[0], high + beyond[1]
+
+
+def _cut_walls(home: Home) -> tuple[Floats, Floats]:
+    """Return the lines in which the building meets a horizontal plane, and their normals.
+
+    Lines have shape (n, 2, 3) [m], outward normals of their faces shape (n, 3): zero for an open
+    surface, which is a wall of both sides.
+    """
     from trimesh.intersections import mesh_plane
 
-    up, origin = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, _WALL_HEIGHT])
-    sections, normals = [np.zeros((0, 2, 3))], [np.zeros((0, 3))]
-    for part in (part for link in home.building for part in link.solid):
-        mesh = part.make_mesh()
-        cut, faces = mesh_plane(mesh, up, origin, return_faces=True)
-        sections.append(np.asarray(cut).reshape(-1, 2, 3))
-        # An open surface is a wall of both sides.
-        normals.append(mesh.face_normals[faces] if mesh.is_watertight else np.zeros((len(cut), 3)))
-    lines, outward = np.concatenate(sections), np.concatenate(normals)
-    beyond = np.zeros((2, 3))
-    for axis, side in itertools.product((0, 1), (0, 1)):
-        depth = min(_WALL_DEPTH, 0.5 * float((high - low)[axis]))
-        distance = np.abs(lines[:, :, axis] - (low, high)[side][axis]).max(axis=1)
-        inward = (1.0, -1.0)[side] * outward[:, axis] >= 0.0
-        is_wall = inward & (distance < depth)
-        along = np.sort(lines[is_wall][:, :, 1 - axis], axis=1)
-        covered, reached = 0.0, -np.inf
-        for start, end in sorted(map(tuple, along)):
-            covered += max(0.0, end - max(start, reached))
-            reached = max(reached, end)
-        if covered < 0.5 * (high - low)[1 - axis]:
-            beyond[side, axis] = _FLOOR_BEYOND
-    return low - beyond[0], high + beyond[1]
+    up = np.array([0.0, 0.0, 1.0])
+    origin = np.array([0.0, 0.0, _WALL_HEIGHT])
+    lines = [np.zeros((0, 2, 3))]
+    normals = [np.zeros((0, 3))]
+    for link in home.building:
+        for part in link.solid:
+            mesh = part.make_mesh()
+            cut, faces = mesh_plane(mesh, up, origin, return_faces=True)
+            lines.append(np.asarray(cut).reshape(-1, 2, 3))
+            outward = mesh.face_normals[faces] if mesh.is_watertight else np.zeros((len(cut), 3))
+            normals.append(outward)
+    return np.concatenate(lines), np.concatenate(normals)
+
+
+def _measure_union(intervals: Floats) -> float:
+    """Return the length that intervals, shape (n, 2), cover together."""
+    covered = 0.0
+    reached = -np.inf
+    for start, end in sorted(map(tuple, intervals)):
+        covered += max(0.0, end - max(start, reached))
+        reached = max(reached, end)
+    return covered
 
 
 def _extract_links(
@@ -178,11 +232,8 @@ def _extract_links(
     """Return some links and the joints between them as a description without notes."""
     part = description.extract_subtree(root)
     links = {name: link for name, link in part.links.items() if name in links_of_object}
-    return Description(
-        description.file,
-        links,
-        {child: joint for child, joint in part.joints.items() if child in links_of_object},
-    )
+    joints = {child: joint for child, joint in part.joints.items() if child in links_of_object}
+    return Description(description.file, links, joints)
 
 
 def _add_empty_base(description: Description, child: str) -> Description:
@@ -191,23 +242,23 @@ def _add_empty_base(description: Description, child: str) -> Description:
     base = f"{child}_base"
     while base in description.links:
         base += "_"
-    joint: Joint = dataclasses.replace(description.joints[child], parent=base)
-    return Description(
-        description.file, {base: Link(base), **part.links}, {child: joint, **part.joints}
-    )
+    joint = dataclasses.replace(description.joints[child], parent=base)
+    links = {base: Link(base), **part.links}
+    joints = {child: joint, **part.joints}
+    return Description(description.file, links, joints)
 
 
 def _place_object(
     name: str, description: Description, place: pin.SE3, *, free: bool = False
 ) -> HomeObject:
     """Return an object whose root is at `place` in the world."""
-    inside = move_root(_remove_prefix(description, f"{name}::"), place)
-    low, high = compute_bounds(inside, load_surfaces(inside), find_closed_positions(inside))
+    in_world = move_root(_remove_prefix(description, f"{name}::"), place)
+    closed = find_closed_positions(in_world)
+    low, high = compute_bounds(in_world, load_surfaces(in_world), closed)
     x, y = ((low + high) / 2.0).round(6)[:2].tolist()
     z = float(low[2].round(6)) if free else 0.0
-    return HomeObject(
-        name, move_root(inside, pin.SE3(np.eye(3), -np.array([x, y, z]))), (x, y, z), free
-    )
+    to_origin = pin.SE3(np.eye(3), -np.array([x, y, z]))
+    return HomeObject(name, move_root(in_world, to_origin), (x, y, z), free)
 
 
 def _remove_prefix(description: Description, prefix: str) -> Description:

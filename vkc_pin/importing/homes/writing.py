@@ -33,6 +33,8 @@ from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.models.robot import Robot
 
 _LIFT = 0.2  # [m] by which a free object is lifted to test whether a hand can hold it
+# [m], and without unit: tolerance within which a visual and a collision shape coincide
+_ALIKE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,17 +58,13 @@ class ImportedHomeObject:
 
     def summary(self) -> str:
         """Return a line about the attachments of the object."""
-        best = {
-            joint: self.proposals.opening(joint)
-            for joint in self.proposals.object.coordinates.names
-        }
-        parts = []
-        for joint, proposals in best.items():
-            by = (
-                f"by {proposals[0].attachment.name}"
-                if proposals
-                else f"by no hand: {self.proposals.because.get(joint, 'no grasp fits')}"
-            )
+        parts = list[str]()
+        for joint in self.proposals.object.coordinates.names:
+            found = self.proposals.opening(joint)
+            if found:
+                by = f"by {found[0].attachment.name}"
+            else:
+                by = f"by no hand: {self.proposals.because.get(joint, 'no grasp fits')}"
             parts.append(f"carried {by}" if self.free else f"{joint} {by}")
         return f"{self.name}: {'; '.join(parts)}"
 
@@ -99,29 +97,24 @@ def write_object(
     description = decompose_links(description, load_surfaces(description), cache)
     description = add_missing_limits(description)
     address = f"objects/{stem}/{stem}.yaml"
-    yaml, urdf = folder / address, (folder / address).with_suffix(".urdf")
+    yaml = folder / address
+    urdf = yaml.with_suffix(".urdf")
+    springs = description.joints.values()
     with tempfile.TemporaryDirectory(dir=folder) as scratch:
         trial = Path(scratch) / yaml.name if item.free else yaml
         write_urdf(description, trial.with_suffix(".urdf"))
-        springs = description.joints.values()
         write_description(trial, urdf.name, (), about=(), joints=springs)
         proposals = propose_attachments(load_object(trial), robot, most=most, **clearances)
     if item.free:
         write_urdf(_remove_lift_joint(description), urdf)
     about = [f"Attachments as proposed for the hand of {proposals.hand.robot}, best first."]
-    about += [f"No hand can move {joint}: {reason}." for joint, reason in proposals.because.items()]
-    write_description(
-        yaml,
-        urdf.name,
-        [proposal.description() for proposal in proposals.found],
-        about=about,
-        joints=springs,
-        free=item.free,
-    )
+    for joint, reason in proposals.because.items():
+        about.append(f"No hand can move {joint}: {reason}.")
+    found = [proposal.description() for proposal in proposals.found]
+    write_description(yaml, urdf.name, found, about=about, joints=springs, free=item.free)
     # The trial file is temporary.
-    proposals = dataclasses.replace(
-        proposals, object=dataclasses.replace(proposals.object, urdf=None)
-    )
+    without_file = dataclasses.replace(proposals.object, urdf=None)
+    proposals = dataclasses.replace(proposals, object=without_file)
     entry = {"name": item.name, "type": address, "position": list(item.position)}
     return ImportedHomeObject(item.name, item.free, proposals, entry, description.notes)
 
@@ -129,29 +122,24 @@ def write_object(
 def _add_lift_joint(description: Description) -> Description:
     """Return a free object as one that slides upwards."""
     child = description.root
-    base, up = f"{child}_stand", np.array([0.0, 0.0, 1.0])
+    base = f"{child}_stand"
     lift = Joint(
         name="lift",
         kind="prismatic",
         parent=base,
         child=child,
         placement=pin.SE3.Identity(),
-        axis=up,
+        axis=np.array([0.0, 0.0, 1.0]),
         limits=(0.0, _LIFT),
     )
-    return dataclasses.replace(
-        description, links={base: Link(base), **description.links}, joints={child: lift}
-    )
+    links = {base: Link(base), **description.links}
+    return dataclasses.replace(description, links=links, joints={child: lift})
 
 
 def _remove_lift_joint(description: Description) -> Description:
     """Return the object without its lift joint."""
-    ((child, _),) = description.joints.items()
+    (child,) = description.joints
     return dataclasses.replace(description, links={child: description.links[child]}, joints={})
-
-
-# [m], and without unit: tolerance within which a visual and a collision shape coincide
-_ALIKE = 1e-4
 
 
 def write_obstacles(
@@ -169,8 +157,10 @@ def write_obstacles(
     pieces, whose origin is on the floor below its centre. Links are those of the file, by the name
     of the obstacle.
     """
-    entries, notes = list[dict[str, Any]](), list[str]()
-    named, sources = dict[str, Link](), dict[str, str]()
+    entries = list[dict[str, Any]]()
+    notes = list[str]()
+    named = dict[str, Link]()
+    sources = dict[str, str]()
     for source_link, link in _iterate_obstacle_links(home):
         name = choose_name(link.name, taken)
         named[name] = link
@@ -183,15 +173,15 @@ def write_obstacles(
             continue
         description = Description(source, {name: Link(name, link.visual, link.collision)}, {})
         low, high = compute_bounds(description, load_surfaces(description))
-        origin = np.array([*((low + high) / 2.0)[:2], 0.0]).round(6)
+        x, y = ((low + high) / 2.0)[:2]
+        origin = np.array([x, y, 0.0]).round(6)
         description = move_root(description, pin.SE3(np.eye(3), -origin))
         description = decompose_links(description, load_surfaces(description), cache)
         notes += description.notes
         address = f"obstacles/{stems[name]}/{stems[name]}.urdf"
         write_urdf(description, folder / address)
-        entries.append(
-            {"name": name, "type": "urdf", "file": address, "position": round_values(origin)}
-        )
+        position = round_values(origin)
+        entries.append({"name": name, "type": "urdf", "file": address, "position": position})
     return entries, sources, notes
 
 
@@ -217,11 +207,11 @@ def _make_simple_entry(name: str, link: Link) -> dict[str, Any]:
     (part,) = link.solid
     size = [round(float(value), 6) for value in part.size]
     entry: dict[str, Any] = {"name": name, "type": part.kind}
-    entry |= (
-        {"size": size}
-        if part.kind == "box"
-        else dict(zip(("radius", "length"), size, strict=False))
-    )
+    if part.kind == "box":
+        entry["size"] = size
+    else:
+        # A sphere has no length.
+        entry.update(zip(("radius", "length"), size, strict=False))
     entry["position"] = round_values(part.placement.translation)
     if not np.allclose(part.placement.rotation, np.eye(3), atol=1e-9):
         entry["rpy"] = round_values(pin.rpy.matrixToRpy(part.placement.rotation), 9)
@@ -236,11 +226,7 @@ def _find_colour(part: Part, visual: Iterable[Part]) -> Colour | None:
     if part.colour is not None:
         return part.colour
     placement = part.placement.homogeneous
-    return next(
-        (
-            other.colour
-            for other in visual
-            if np.allclose(other.placement.homogeneous, placement, atol=_ALIKE)
-        ),
-        None,
-    )
+    for other in visual:
+        if np.allclose(other.placement.homogeneous, placement, atol=_ALIKE):
+            return other.colour
+    return None

@@ -11,15 +11,13 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
-from vkc_pin.importing.description import Description, Link, Part
+from vkc_pin.importing.description import MOVING_KINDS, Description, Joint, Link, Part
 from vkc_pin.utils.arrays import Floats
 
 if TYPE_CHECKING:
     import trimesh
 
 
-MOVING = ("revolute", "continuous", "prismatic")
-"""Kinds of joints that have a position."""
 Surfaces = Mapping[int, "trimesh.Trimesh"]
 """Surfaces of parts in the frame of their link, by `id` of the part."""
 _UP = {"z": np.eye(3), "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])}
@@ -31,22 +29,22 @@ def find_multiple_objects(description: Description) -> tuple[str, ...]:
     Several objects hang on a root without shapes, as in a scene file. If all of them are drawers
     that slide on it, they are one chest of drawers.
     """
-    joints, root = description.joints, description.root
-    children = [child for child, joint in joints.items() if joint.parent == root]
-    counts = {
-        link: sum(joints[child].kind != "fixed" for child in description.subtree(link))
-        for link in children
-    }
-    objects = {link: count for link, count in counts.items() if count}
-    if (
-        len(objects) < 2
-        or description.links[root].solid
-        or all(joints[link].kind != "fixed" for link in objects)
-    ):
+    joints = description.joints
+    root = description.root
+    counts = dict[str, int]()  # of joints that are not fixed, by the link on the root
+    for link in description.children().get(root, ()):
+        count = sum(joints[child].kind != "fixed" for child in description.subtree(link))
+        if count > 0:
+            counts[link] = count
+    has_base = bool(description.links[root].solid)
+    are_drawers = all(joints[link].kind != "fixed" for link in counts)
+    if len(counts) < 2 or has_base or are_drawers:
         return ()
-    listed = ", ".join(
-        f"'{link}' ({count} joint{'s' * (count != 1)})" for link, count in objects.items()
-    )
+    objects = list[str]()
+    for link, count in counts.items():
+        noun = "joint" if count == 1 else "joints"
+        objects.append(f"'{link}' ({count} {noun})")
+    listed = ", ".join(objects)
     return (
         f"the file holds several objects: {listed}; to import only one, name it (link, --link)",
     )
@@ -58,8 +56,10 @@ def choose_name(wanted: str, taken: set[str]) -> str:
     Unprintable characters, ".", "/" and spaces become "_"; equal results are numbered.
     """
     plain = re.sub(r"[\s./]+", "_", wanted)
-    stem = "".join(letter if letter.isprintable() else "_" for letter in plain).strip("_") or "part"
-    name, number = stem, 1
+    printable = "".join(letter if letter.isprintable() else "_" for letter in plain)
+    stem = printable.strip("_") or "part"
+    name = stem
+    number = 1
     while name in taken:
         number += 1
         name = f"{stem}_{number}"
@@ -87,11 +87,10 @@ def fix_immovable_joints(description: Description) -> Description:
     notes = list(description.notes)
     closed_positions = find_closed_positions(description)
     for child, joint in description.joints.items():
-        if joint.kind not in MOVING:
+        if joint.kind not in MOVING_KINDS:
             continue
-        moved_links = [
-            description.links[name] for name in collect_attached_links(description, child)
-        ]
+        moved_names = collect_attached_links(description, child)
+        moved_links = [description.links[name] for name in moved_names]
         if joint.limits is not None and joint.limits[0] == joint.limits[1]:
             notes.append(f"joint '{joint.name}' has a single value: fixed")
         elif not any(link.solid for link in moved_links):
@@ -153,20 +152,20 @@ def merge_fixed_links(description: Description) -> Description:
 
 def _transform_parts(link: Link, parts: tuple[Part, ...], placement: pin.SE3) -> tuple[Part, ...]:
     """Return the parts of a link in a frame in which the link is at `placement`."""
-    return tuple(
-        dataclasses.replace(
-            part, name=f"{link.name}_{part.name}".rstrip("_"), placement=placement * part.placement
-        )
-        for part in parts
-    )
+    moved = list[Part]()
+    for part in parts:
+        name = f"{link.name}_{part.name}".rstrip("_")
+        moved.append(dataclasses.replace(part.transform(placement), name=name))
+    return tuple(moved)
 
 
 def load_surfaces(description: Description) -> Surfaces:
     """Return the surfaces of all visual and collision shapes."""
-    parts = [
-        part for link in description.links.values() for part in (*link.visual, *link.collision)
-    ]
-    return {id(part): part.make_mesh() for part in parts}
+    surfaces: dict[int, trimesh.Trimesh] = {}
+    for link in description.links.values():
+        for part in (*link.visual, *link.collision):
+            surfaces[id(part)] = part.make_mesh()
+    return surfaces
 
 
 def compute_bounds(
@@ -176,7 +175,8 @@ def compute_bounds(
     placements = description.compute_placements(values)
     points = place_vertices(description, meshes, placements, description.links)
     if not points:
-        notes = "; ".join(description.notes[:3])  # they say what was left out
+        # They say what was left out.
+        notes = "; ".join(description.notes[:3])
         raise InputError(
             "no shapes are left" if notes else "the file has no shapes",
             file=description.file,
@@ -194,53 +194,60 @@ def place_vertices(
     links: Iterable[str],
 ) -> list[Floats]:
     """Return the vertices of the links' parts in the root's frame, shape (n, 3) [m] each."""
-    return [
-        np.asarray(meshes[id(part)].vertices) @ placements[name].rotation.T
-        + placements[name].translation
-        for name in links
-        for part in description.links[name].solid
-    ]
+    placed = list[Floats]()
+    for name in links:
+        placement = placements[name]
+        for part in description.links[name].solid:
+            vertices = np.asarray(meshes[id(part)].vertices)
+            placed.append(vertices @ placement.rotation.T + placement.translation)
+    return placed
 
 
 def find_closed_positions(description: Description) -> dict[str, float]:
     """Return the closed positions of joints, zero or the nearest limit, [rad] or [m]."""
-    return {
-        joint.name: min(max(0.0, joint.limits[0]), joint.limits[1])
-        for joint in description.joints.values()
-        if joint.limits
-    }
+    positions = dict[str, float]()
+    for joint in description.joints.values():
+        if joint.limits is not None:
+            low, high = joint.limits
+            positions[joint.name] = min(max(0.0, low), high)
+    return positions
 
 
 def scale_object(description: Description, factor: float) -> Description:
     """Scale an object: shapes, joint placements and prismatic limits; masses stay as stated."""
-    links = {}
+    links = dict[str, Link]()
     for name, link in description.links.items():
-        visual, collision = (
-            tuple(_scale_part(part, factor) for part in parts)
-            for parts in (link.visual, link.collision)
-        )
+        visual = tuple(_scale_part(part, factor) for part in link.visual)
+        collision = tuple(_scale_part(part, factor) for part in link.collision)
+        # Moments of inertia grow with the square of lengths if the mass stays.
         inertia = pin.Inertia(
             link.inertia.mass, factor * link.inertia.lever, factor**2 * link.inertia.inertia
         )
         links[name] = Link(name, visual, collision, inertia)
-    joints = {}
-    for child, joint in description.joints.items():
-        limits, springref = joint.limits, joint.springref
-        if joint.kind == "prismatic":
-            springref *= factor
-            limits = limits and (factor * limits[0], factor * limits[1])
-        placement = pin.SE3(joint.placement.rotation, factor * joint.placement.translation)
-        joints[child] = dataclasses.replace(
-            joint, placement=placement, limits=limits, springref=springref
-        )
+    joints = {child: _scale_joint(joint, factor) for child, joint in description.joints.items()}
     return dataclasses.replace(description, links=links, joints=joints)
 
 
 def _scale_part(part: Part, factor: float) -> Part:
-    placement = pin.SE3(part.placement.rotation, factor * part.placement.translation)
-    return dataclasses.replace(
-        part, placement=placement, size=tuple(factor * size for size in part.size)
-    )
+    placement = _scale_placement(part.placement, factor)
+    size = tuple(factor * length for length in part.size)
+    return dataclasses.replace(part, placement=placement, size=size)
+
+
+def _scale_joint(joint: Joint, factor: float) -> Joint:
+    placement = _scale_placement(joint.placement, factor)
+    if joint.kind != "prismatic":
+        return dataclasses.replace(joint, placement=placement)
+    limits = joint.limits
+    if limits is not None:
+        low, high = limits
+        limits = (factor * low, factor * high)
+    springref = joint.springref * factor
+    return dataclasses.replace(joint, placement=placement, limits=limits, springref=springref)
+
+
+def _scale_placement(placement: pin.SE3, factor: float) -> pin.SE3:
+    return pin.SE3(placement.rotation, factor * placement.translation)
 
 
 def make_upright(description: Description, up: str) -> Description:
@@ -250,12 +257,11 @@ def make_upright(description: Description, up: str) -> Description:
 
 def move_root(description: Description, placement: pin.SE3) -> Description:
     """Return the object with its root's frame moved such that the old one is at `placement`."""
-    links, root = dict(description.links), description.root
+    root = description.root
+    links = dict(description.links)
     links[root] = links[root].transform(placement)
-    joints = {
-        child: dataclasses.replace(joint, placement=placement * joint.placement)
-        if joint.parent == root
-        else joint
-        for child, joint in description.joints.items()
-    }
+    joints = dict(description.joints)
+    for child, joint in description.joints.items():
+        if joint.parent == root:
+            joints[child] = dataclasses.replace(joint, placement=placement * joint.placement)
     return dataclasses.replace(description, links=links, joints=joints)

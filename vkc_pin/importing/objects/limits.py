@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.importing.convex import ERROR
-from vkc_pin.importing.description import SOLIDS, Description, Joint
+from vkc_pin.importing.description import SOLIDS, Description, Joint, Limits
 from vkc_pin.importing.objects.clean_up import compute_bounds, load_surfaces, place_vertices
 from vkc_pin.world.files.meshes import make_convex_hull
 from vkc_pin.world.models.shapes import compute_shape_distance, compute_world_box
@@ -37,19 +37,27 @@ def add_missing_limits(description: Description) -> Description:
     notes += _note_tiny_ranges(description)
     chooser = None
     for child, joint in description.joints.items():
-        ends = joint.limits or (-np.inf, np.inf)
-        if joint.kind not in ("revolute", "prismatic") or np.isfinite(ends).all():
+        stated = joint.limits or (-np.inf, np.inf)
+        if joint.kind not in ("revolute", "prismatic") or np.isfinite(stated).all():
             continue
-        chooser = _Chooser(description) if chooser is None else chooser
-        limits, reason = chooser.choose(child, ends)
+        if chooser is None:
+            chooser = _Chooser(description)
+        limits, reason = chooser.choose(child, stated)
         joints[child] = dataclasses.replace(joint, limits=limits)
-        missing = "no limits"
-        if np.isfinite(ends).any():
-            missing = f"no {'lower' if np.isinf(ends[0]) else 'upper'} limit"
+        low, high = limits
         unit = "rad" if joint.kind == "revolute" else "m"
-        chosen = f"{limits[0]:.3g} to {limits[1]:.3g} {unit}"
+        chosen = f"{low:.3g} to {high:.3g} {unit}"
+        missing = _describe_missing(stated)
         notes.append(f"joint '{joint.name}' states {missing}: {chosen} assumed{reason}")
     return dataclasses.replace(description, joints=joints, notes=tuple(notes))
+
+
+def _describe_missing(stated: Limits) -> str:
+    """Return in words which of the limits of a joint are infinite."""
+    lower, upper = np.isinf(stated)
+    if lower and upper:
+        return "no limits"
+    return "no lower limit" if lower else "no upper limit"
 
 
 def _note_tiny_ranges(description: Description) -> Iterator[str]:
@@ -85,27 +93,44 @@ class _Chooser:
                     solid = SOLIDS[part.kind](*part.size)
                     yield name, solid, self._placements[name] * part.placement
 
-    def choose(self, child: str, ends: tuple[float, float]) -> tuple[tuple[float, float], str]:
+    def choose(self, child: str, stated: Limits) -> tuple[Limits, str]:
         """Return the limits of a joint, and the reason for a note.
 
         Args:
             child: Link that the joint carries.
-            ends: Its stated limits, of which one or both are infinite.
+            stated: Its stated limits, of which one or both are infinite.
         """
         joint = self.description.joints[child]
         away, travel = self._measure(child, joint)
-        low, high = ends
+        low, high = stated
         if np.isfinite(low) and low < 0.0:
             return (low, 0.0), ""
         if np.isfinite(high) and high > 0.0:
             return (0.0, high), ""
-        if np.isfinite(low) or np.isfinite(high):
-            start, sign = (low, 1.0) if np.isfinite(low) else (high, -1.0)
-            reached, blocker = self._follow(child, start, sign * travel)
-            if reached < _LEAST:
-                reached, blocker = 1.0, None
-            end = start + sign * reached * travel
-            return (min(start, end), max(start, end)), f", up to '{blocker}'" if blocker else ""
+        if np.isfinite(low):
+            return self._choose_other_limit(child, low, travel)
+        if np.isfinite(high):
+            return self._choose_other_limit(child, high, -travel)
+        return self._choose_both_limits(child, away, travel)
+
+    def _choose_other_limit(self, child: str, start: float, travel: float) -> tuple[Limits, str]:
+        """Return limits from one, `start`, to the end of a travel with its sign, and a reason."""
+        reached, blocker = self._follow(child, start, travel)
+        if reached < _LEAST:
+            reached = 1.0
+            blocker = None
+        end = start + reached * travel
+        limits = (min(start, end), max(start, end))
+        return limits, "" if blocker is None else f", up to '{blocker}'"
+
+    def _choose_both_limits(self, child: str, away: float, travel: float) -> tuple[Limits, str]:
+        """Return limits from 0 in the direction that is freer, and a reason.
+
+        Args:
+            child: Link that the joint carries.
+            away: Sign of the direction away from the centre, which is preferred.
+            travel: Travel of the joint, [rad] or [m].
+        """
         reached, blocker = self._follow(child, 0.0, away * travel)
         reason = ", away from centre"
         if blocker is not None:
@@ -114,7 +139,9 @@ class _Chooser:
                 reached = 1.0
             elif other_reached > reached:
                 reason = f", towards the centre, since '{blocker}' is in the other direction"
-                away, reached, blocker = -away, other_reached, other_blocker
+                away = -away
+                reached = other_reached
+                blocker = other_blocker
             if reached < 1.0:
                 reason = f"{reason}, up to '{blocker}'"
         end = away * reached * travel
@@ -138,30 +165,34 @@ class _Chooser:
         return sign, travel
 
     def _follow(self, child: str, start: float, travel: float) -> tuple[float, str | None]:
-        """Return the part of a travel before shapes meet, and the link that is met, if any."""
+        """Return the part of a travel before shapes meet, and the link that is met, if any.
+
+        Shapes meet where they overlap more than at the start by `_TOUCH`.
+        """
         below = self.description.subtree(child)
         moving = [shape for shape in self._shapes if shape[0] in below]
         others = [shape for shape in self._shapes if shape[0] not in below]
         boxes = [compute_world_box(solid, place) for _, solid, place in others]
         low = np.array([box[0] for box in boxes]).reshape(-1, 3)
         high = np.array([box[1] for box in boxes]).reshape(-1, 3)
-        closed_depths: dict[tuple[int, int], float] = {}
+        motion_at_start = self._compute_motion(child, start)
+        start_depths = dict[tuple[int, int], float]()  # of pairs that have come near
         for step in range(1, _STEPS + 1):
             motion = self._compute_motion(child, start + travel * step / _STEPS)
-            before = self._compute_motion(child, start)
             for m, (_, solid, place) in enumerate(moving):
                 here = motion * place
                 box_low, box_high = compute_world_box(solid, here)
-                near = (low < box_high).all(axis=1) & (high > box_low).all(axis=1)
-                for k in np.flatnonzero(near).tolist():
+                is_near = (low < box_high).all(axis=1) & (high > box_low).all(axis=1)
+                for k in np.flatnonzero(is_near).tolist():
                     link, other, other_place = others[k]
                     depth = -compute_shape_distance(solid, here, other, other_place)
                     if depth <= _TOUCH:
                         continue
-                    if (m, k) not in closed_depths:
-                        closed = compute_shape_distance(solid, before * place, other, other_place)
-                        closed_depths[m, k] = max(0.0, -closed)
-                    if depth > closed_depths[m, k] + _TOUCH:
+                    if (m, k) not in start_depths:
+                        there = motion_at_start * place
+                        distance = compute_shape_distance(solid, there, other, other_place)
+                        start_depths[m, k] = max(0.0, -distance)
+                    if depth > start_depths[m, k] + _TOUCH:
                         return (step - 1) / _STEPS, link
         return 1.0, None
 

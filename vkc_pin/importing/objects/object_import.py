@@ -54,7 +54,9 @@ from vkc_pin.world.models.robot_file import load_robot
 _COMMAND = "import-object"
 # Generic file names, which do not name an object
 _GENERAL = ("mobility", "model", "object", "scene", "index", "main")
-_SMALL, _LARGE = 0.02, 3.5  # [m] plausible heights of an object
+# Plausible heights of an object [m]
+_SMALL = 0.02
+_LARGE = 3.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,16 +85,12 @@ class ImportedObject:
         """Return a readable report."""
         pieces = len(self.object.collision.geometryObjects)
         joints = len(self.object.coordinates.names)
+        noun = "joint" if joints == 1 else "joints"
         size = " × ".join(f"{length:.2f}" for length in self.size)
-        counts = f"{joints} joint{'s' * (joints != 1)}, {pieces} convex pieces"
-        head = f"{self.object.name}: {size} m, {counts}"
-        notes = [f"  {note}" for note in self.notes]
-        lines = [
-            head,
-            *notes,
-            f"attachments for the hand of {self.proposals.hand.robot}, best first:",
-            self.proposals.summary(),
-        ]
+        lines = [f"{self.object.name}: {size} m, {joints} {noun}, {pieces} convex pieces"]
+        lines += [f"  {note}" for note in self.notes]
+        lines.append(f"attachments for the hand of {self.proposals.hand.robot}, best first:")
+        lines.append(self.proposals.summary())
         return "\n".join(lines)
 
 
@@ -145,7 +143,7 @@ def import_object(  # noqa: PLR0913 - keyword options of a public call
     check_integer(most, "most", low=1, high=100)
     options = Options() if options is None else check_instance(options, Options, "options")
     clearances = {"dist_safe": options.dist_safe, "grasp_clearance": options.grasp_clearance}
-    given, robot = robot, robot if isinstance(robot, Robot) else load_robot(robot)
+    loaded_robot = robot if isinstance(robot, Robot) else load_robot(robot)
     name = _choose_name(path, link)
     target = Path(name) if folder is None else check_path(folder, "folder", "a folder")
     check_source(path, "a URDF, xacro, MJCF or SDF file")
@@ -155,7 +153,7 @@ def import_object(  # noqa: PLR0913 - keyword options of a public call
     description = _place_on_floor(description)
     if description.is_massless:
         description = description.add_notes(WEIGHTLESS)
-    work = [measure_links([link], set()) for link in description.links.values()]
+    work = [measure_links([item], set()) for item in description.links.values()]
     progress = ImportProgress([*work, PLACES_WORK * len(description.joints)])
     description = decompose_links(description, load_surfaces(description), progress=progress)
     description = add_missing_limits(description)
@@ -169,22 +167,23 @@ def import_object(  # noqa: PLR0913 - keyword options of a public call
         if link is not None and link != name:
             about.append(f"Name of the link: {link}")
         springs = description.joints.values()
+        # Attachments are proposed for the loaded object, hence it is written twice.
         write_description(yaml, urdf.name, (), about=about, joints=springs)
         progress.begin("attachments")
-        proposals = propose_attachments(load_object(yaml), robot, most=most, **clearances)
+        item = load_object(yaml)
+        proposals = propose_attachments(item, loaded_robot, most=most, **clearances)
         about.append(f"Attachments as proposed for the hand of {proposals.hand.robot}, best first.")
-        about += [
-            f"No hand can open {joint}: {reason}." for joint, reason in proposals.because.items()
-        ]
-        found = [item.description() for item in proposals.found]
+        for joint, reason in proposals.because.items():
+            about.append(f"No hand can open {joint}: {reason}.")
+        found = [proposal.description() for proposal in proposals.found]
         write_description(yaml, urdf.name, found, about=about, joints=springs)
         plot_attachments(proposals, picture)
-        scene = make_object_scene(yaml.name, proposals, size, locate_robot(given), staging)
+        scene = make_object_scene(yaml.name, proposals, size, locate_robot(robot), staging)
         if scene is not None:
-            scene["robot"] = refer_to_robot(given, target)
+            scene["robot"] = refer_to_robot(robot, target)
             write_scene(staging / "scene.yaml", path, scene, _COMMAND)
-    loaded = load_object(target / yaml.name)
     # The files have moved.
+    loaded = load_object(target / yaml.name)
     proposals = dataclasses.replace(proposals, object=dataclasses.replace(loaded, attachments={}))
     return ImportedObject(
         target / yaml.name,
@@ -228,9 +227,16 @@ def _check_size(height: float | None, scale: float | None) -> None:
 
 def _choose_name(path: Path, link: str | None) -> str:
     """Return a name from the link, the file, or the folder of a file with a generic name."""
-    stem = link or (path.resolve().parent.name if path.stem.lower() in _GENERAL else path.stem)
+    if link:
+        stem = link
+    elif path.stem.lower() in _GENERAL:
+        stem = path.resolve().parent.name
+    else:
+        stem = path.stem
     name = re.sub(r"[^A-Za-z0-9_]+", "_", stem).strip("_") or "object"
-    (name,) = choose_file_names([name if name[0].isalpha() else f"object_{name}"])
+    if not name[0].isalpha():
+        name = f"object_{name}"
+    (name,) = choose_file_names([name])
     return name
 
 
@@ -243,7 +249,9 @@ def _scale_to_size(
         raise InputError(
             "the object is flat", file=description.file, expected="shapes that enclose a volume"
         )
-    factor = height / float(high[2] - low[2]) if height is not None else scale or 1.0
+    factor = scale or 1.0
+    if height is not None:
+        factor = height / float(high[2] - low[2])
     size = factor * (high - low)
     if height is None and not _SMALL <= size[2] <= _LARGE:
         note = (
@@ -256,10 +264,8 @@ def _scale_to_size(
 
 def _place_on_floor(description: Description) -> Description:
     """Return the object with its root's frame on the floor, below its closed shape's centre."""
-    low, high = compute_bounds(
-        description, load_surfaces(description), find_closed_positions(description)
-    )
-    return move_root(
-        description,
-        pin.SE3(np.eye(3), -np.array([(low[0] + high[0]) / 2.0, (low[1] + high[1]) / 2.0, low[2]])),
-    )
+    closed = find_closed_positions(description)
+    low, high = compute_bounds(description, load_surfaces(description), closed)
+    middle = (low + high) / 2.0
+    origin = np.array([middle[0], middle[1], low[2]])
+    return move_root(description, pin.SE3(np.eye(3), -origin))

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from vkc_pin.importing.description import Description
+from vkc_pin.importing.description import MOVING_KINDS, Description
 from vkc_pin.importing.formats.reading import read_description
 from vkc_pin.importing.objects.mechanisms import dissolve_mechanisms
 
@@ -15,7 +15,6 @@ WEIGHTLESS = (
     "no mass is stated: arm torques ignore weight and inertia, and simulation assumes a density"
 )
 """Note about an object whose file states no masses."""
-_KINDS = ("fixed", "revolute", "continuous", "prismatic")
 
 
 def read_object(
@@ -49,12 +48,13 @@ def _remove_free_bodies(description: Description) -> Description:
     If there is nothing but one free body, it is the object.
     """
     free = [child for child, joint in description.joints.items() if joint.kind == "floating"]
-    gone = set[str]().union(*(description.subtree(child) for child in free))
-    rest = [link for name, link in description.links.items() if name not in gone]
-    is_alone = not any(link.solid for link in rest)
+    gone = set[str]()
+    for child in free:
+        gone |= description.subtree(child)
+    links = {name: link for name, link in description.links.items() if name not in gone}
+    is_alone = not any(link.solid for link in links.values())
     if is_alone and len(free) == 1:
         return description.extract_subtree(free[0])
-    links = {name: link for name, link in description.links.items() if name not in gone}
     joints = {child: joint for child, joint in description.joints.items() if child not in gone}
     notes = [f"body '{child}' is free, hence a separate object: left out" for child in free]
     return description.add_notes(*notes).keep(links, joints)
@@ -65,7 +65,7 @@ def _fix_other_joints(description: Description) -> Description:
     joints = dict(description.joints)
     notes = list[str]()
     for child, joint in description.joints.items():
-        if joint.kind not in (*_KINDS, "floating"):
+        if joint.kind not in ("fixed", *MOVING_KINDS, "floating"):
             notes.append(f"joint '{joint.name}' is {joint.kind}: taken as fixed")
             joints[child] = replace(joint, kind="fixed", limits=None)
     return replace(description.add_notes(*notes), joints=joints)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import trimesh
 
 
-# [m] Largest protrusion of pieces of moving links, about a finger's clearance from a handle
+# [m] largest protrusion of pieces of moving links, about a finger's clearance from a handle
 _FINE = 0.006
 _INSIDE = 1e-3  # [m] largest protrusion of a piece that counts as inside another
 _TRIANGLE_SIZE = 50.0  # [bytes] of a triangle in a binary STL file; text takes up to twice as much
@@ -70,45 +70,44 @@ def decompose_links(
         cache: Pieces of mesh files that are known, to which new ones are added.
         progress: Progress of an import, whose next parts are the links.
     """
-    notes, links = list(description.notes), dict[str, Link]()
+    notes = list(description.notes)
+    links = dict[str, Link]()
     parts = description.links.values()
     for link in parts if progress is None else progress.follow(parts):
-        name = link.name
-        error = _FINE if name in description.joints else ERROR
-        solids, flat_parts = list[Part](), list[str]()
-        for part in link.solid:
-            mesh = meshes[id(part)]
-            if part.kind != "mesh":
-                solids.append(part)
-                continue
-            title = part.name or (part.file.name if part.file else "a mesh")
-            if is_flat(mesh):
-                flat_parts.append(title)
-            pieces, protrusion = _decompose_part(part, mesh, error, cache)
-            if protrusion > error:
-                far = f"protrude by up to {1e3 * protrusion:.0f} mm (aim: {1e3 * error:g} mm)"
-                notes.append(f"link '{name}': the convex pieces of {title} {far}")
-            solids += [
-                Part(
-                    name=part.name,
-                    placement=pin.SE3.Identity(),
-                    kind="mesh",
-                    size=(1.0, 1.0, 1.0),
-                    triangles=piece,
-                    colour=part.colour,
-                )
-                for piece in pieces
-            ]
-        if flat_parts:
-            names = ", ".join(dict.fromkeys(flat_parts))
-            made = f"flat shapes were made {1e3 * SHEET_THICKNESS:g} mm thick"
-            notes.append(f"link '{name}': {made}: {names}")
-        if link.visual and not link.collision:
-            notes.append(f"link '{name}' has no collision geometry: its visual geometry is used")
-        links[name] = Link(
-            name, link.visual or link.collision, tuple(_remove_inner(solids)), link.inertia
-        )
+        error = _FINE if link.name in description.joints else ERROR
+        solids = _decompose_link(link, meshes, error, cache, notes)
+        visual = link.visual or link.collision
+        collision = tuple(_remove_inner(solids))
+        links[link.name] = Link(link.name, visual, collision, link.inertia)
     return dataclasses.replace(description, links=links, notes=tuple(notes))
+
+
+def _decompose_link(
+    link: Link, meshes: Surfaces, error: float, cache: PieceCache | None, notes: list[str]
+) -> list[Part]:
+    """Return the convex shapes of a link, and add notes about them."""
+    solids = list[Part]()
+    flat_parts = list[str]()
+    for part in link.solid:
+        mesh = meshes[id(part)]
+        if part.kind != "mesh":
+            solids.append(part)
+            continue
+        title = part.name or (part.file.name if part.file else "a mesh")
+        if is_flat(mesh):
+            flat_parts.append(title)
+        pieces, protrusion = _decompose_part(part, mesh, error, cache)
+        if protrusion > error:
+            far = f"protrude by up to {1e3 * protrusion:.0f} mm (aim: {1e3 * error:g} mm)"
+            notes.append(f"link '{link.name}': the convex pieces of {title} {far}")
+        solids += [Part.from_triangles(part.name, piece, part.colour) for piece in pieces]
+    if flat_parts:
+        names = ", ".join(dict.fromkeys(flat_parts))
+        made = f"flat shapes were made {1e3 * SHEET_THICKNESS:g} mm thick"
+        notes.append(f"link '{link.name}': {made}: {names}")
+    if link.visual and not link.collision:
+        notes.append(f"link '{link.name}' has no collision geometry: its visual geometry is used")
+    return solids
 
 
 def _decompose_part(
@@ -120,22 +119,25 @@ def _decompose_part(
         return pieces.meshes, pieces.error
     key = (part.file, part.size, error)
     if key not in cache:
-        there = dataclasses.replace(part, placement=pin.SE3.Identity())
-        cache[key] = decompose(there.make_mesh(), error=error)
-    found, placement = cache[key], part.placement.homogeneous
+        in_own_frame = dataclasses.replace(part, placement=pin.SE3.Identity())
+        cache[key] = decompose(in_own_frame.make_mesh(), error=error)
+    found = cache[key]
+    placement = part.placement.homogeneous
     return [piece.copy().apply_transform(placement) for piece in found.meshes], found.error
 
 
 def _remove_inner(parts: list[Part]) -> list[Part]:
     """Return the parts without meshes that lie inside another one."""
-    meshes = {
-        k: part.triangles
-        for k, part in enumerate(parts)
-        if part.triangles is not None and part.kind == "mesh"
-    }
+    meshes: dict[int, trimesh.Trimesh] = {}  # by the number of the part
+    for k, part in enumerate(parts):
+        if part.triangles is not None and part.kind == "mesh":
+            meshes[k] = part.triangles
+    # A mesh can lie in a larger one only.
+    largest_first = sorted(meshes, key=lambda k: -meshes[k].volume)
     outer = list[int]()
-    for k in sorted(meshes, key=lambda k: -meshes[k].volume):
+    for k in largest_first:
         corners = np.asarray(meshes[k].vertices)
-        if all(measure_outside(meshes[other], corners).max() >= _INSIDE for other in outer):
+        protrusions = (measure_outside(meshes[other], corners).max() for other in outer)
+        if all(protrusion >= _INSIDE for protrusion in protrusions):
             outer.append(k)
     return [part for k, part in enumerate(parts) if k not in meshes or k in outer]

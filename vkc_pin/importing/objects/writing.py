@@ -6,7 +6,7 @@ import dataclasses
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -19,10 +19,6 @@ from vkc_pin.world.files.meshes import load_parts
 from vkc_pin.world.files.resources import choose_file_names
 from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.world.models.articulated_object import DEFAULT_VELOCITY
-
-if TYPE_CHECKING:
-    import trimesh
-
 
 _EFFORT = 100.0  # [N], [N·m] effort limit of joints for which a file states none
 _GREY: Colour = (0.75, 0.75, 0.75, 1.0)
@@ -38,23 +34,16 @@ def write_urdf(description: Description, file: Path) -> None:
     stems = choose_file_names(description.links)
     links = dict[str, Link]()
     for stem, (name, link) in zip(stems, description.links.items(), strict=True):
-        visual = [
-            _write_mesh(part, file.parent / "visual" / f"{stem}_{number}.stl")
-            for number, part in enumerate(_merge_visuals(link))
-        ]
-        collision = [
-            _write_mesh(part, file.parent / "collision" / f"{stem}_{number}.stl")
-            for number, part in enumerate(_replace_capsules(link.collision))
-        ]
-        links[name] = Link(link.name, tuple(visual), tuple(collision), link.inertia)
-    joints = {
-        child: dataclasses.replace(
-            joint,
-            velocity=joint.velocity or DEFAULT_VELOCITY,
-            effort=joint.effort or _EFFORT,
+        visual = _write_meshes(_merge_visuals(link), file.parent / "visual", stem)
+        collision = _write_meshes(
+            _replace_capsules(link.collision), file.parent / "collision", stem
         )
-        for child, joint in description.joints.items()
-    }
+        links[name] = Link(link.name, visual, collision, link.inertia)
+    joints = dict[str, Joint]()
+    for child, joint in description.joints.items():
+        velocity = joint.velocity or DEFAULT_VELOCITY
+        effort = joint.effort or _EFFORT
+        joints[child] = dataclasses.replace(joint, velocity=velocity, effort=effort)
     written = dataclasses.replace(description, links=links, joints=joints)
     root = make_urdf(written, file.stem, file.parent)
     ElementTree.indent(root)
@@ -73,17 +62,19 @@ def write_description(
 ) -> None:
     """Write the description of an object, with the springs of its joints."""
     head = "".join(map(format_comment, about))
-    springs = {
-        joint.name: {"stiffness": round(joint.stiffness, 9), "springref": round(joint.springref, 9)}
-        for joint in joints
-        if joint.stiffness > 0.0
-    }
-    data = {
-        "urdf": urdf,
-        **({"joints": springs} if springs else {}),
-        **({"free": True} if free else {}),
-        "attachments": [dict(item) for item in attachments],
-    }
+    springs = dict[str, dict[str, float]]()
+    for joint in joints:
+        if joint.stiffness > 0.0:
+            springs[joint.name] = {
+                "stiffness": round(joint.stiffness, 9),
+                "springref": round(joint.springref, 9),
+            }
+    data: dict[str, Any] = {"urdf": urdf}
+    if springs:
+        data["joints"] = springs
+    if free:
+        data["free"] = True
+    data["attachments"] = [dict(item) for item in attachments]
     body = yaml.safe_dump(data, sort_keys=False, width=130)
     write_atomically(file, (head + body).encode())
 
@@ -98,6 +89,7 @@ def _merge_visuals(link: Link) -> list[Part]:
         if part.kind != "mesh":
             shapes.append(dataclasses.replace(part, name="", colour=part.colour or _GREY))
         elif part.file is not None and part.colour is None:
+            # The file may have a colour for each of its parts.
             for coloured in load_parts(part.file, part.size):
                 mesh = trimesh.Trimesh(coloured.vertices, coloured.faces, process=False)
                 mesh.apply_transform(part.placement.homogeneous)
@@ -106,7 +98,7 @@ def _merge_visuals(link: Link) -> list[Part]:
             meshes.setdefault(part.colour or _GREY, []).append(part.make_mesh())
     for colour, same in meshes.items():
         merged = trimesh.util.concatenate(same)
-        shapes.append(_make_mesh_part("", merged, colour))
+        shapes.append(Part.from_triangles("", merged, colour))
     return shapes
 
 
@@ -120,9 +112,19 @@ def _replace_capsules(parts: Sequence[Part]) -> list[Part]:
         radius, length = part.size
         shapes.append(dataclasses.replace(part, kind="cylinder"))
         for end in (-length / 2.0, length / 2.0):
-            ball = part.placement * pin.SE3(np.eye(3), np.array([0.0, 0.0, end]))
-            shapes.append(dataclasses.replace(part, kind="sphere", size=(radius,), placement=ball))
+            placement = part.placement * pin.SE3(np.eye(3), np.array([0.0, 0.0, end]))
+            shapes.append(
+                dataclasses.replace(part, kind="sphere", size=(radius,), placement=placement)
+            )
     return shapes
+
+
+def _write_meshes(parts: Sequence[Part], folder: Path, stem: str) -> tuple[Part, ...]:
+    """Write the meshes among some parts as `<stem>_<k>.stl`, and return the parts."""
+    written = list[Part]()
+    for number, part in enumerate(parts):
+        written.append(_write_mesh(part, folder / f"{stem}_{number}.stl"))
+    return tuple(written)
 
 
 def _write_mesh(part: Part, file: Path) -> Part:
@@ -132,16 +134,4 @@ def _write_mesh(part: Part, file: Path) -> Part:
     write_atomically(file, part.make_mesh().export(file_type="stl"))
     return dataclasses.replace(
         part, placement=pin.SE3.Identity(), size=(1.0, 1.0, 1.0), file=file, triangles=None
-    )
-
-
-def _make_mesh_part(name: str, mesh: trimesh.Trimesh, colour: Colour) -> Part:
-    """Return a mesh in the frame of its link."""
-    return Part(
-        name=name,
-        placement=pin.SE3.Identity(),
-        kind="mesh",
-        size=(1.0, 1.0, 1.0),
-        triangles=mesh,
-        colour=colour,
     )

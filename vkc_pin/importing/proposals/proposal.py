@@ -13,9 +13,10 @@ import pinocchio as pin
 from vkc_pin.importing.proposals.hand import Hand
 from vkc_pin.importing.targets import round_values
 from vkc_pin.utils.pickling import freeze
-from vkc_pin.world.models.articulated_object import ArticulatedObject, Attachment
+from vkc_pin.world.models.articulated_object import ArticulatedObject, Attachment, Freedom
 
 _MAX_LISTED = 3  # other joints in a line
+_WHOLE = 1.0 - 1e-3  # part of a range from which it counts as the whole
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,24 +55,30 @@ class Proposal:
         }
         if item.contact == "push":
             data["contact"] = "push"
-            data["freedoms"] = [
-                {
-                    "name": freedom.suffix.removeprefix("_"),
-                    "slide" if freedom.kind == "prismatic" else "turn": freedom.axis.tolist(),
-                    "limits": round_values([freedom.lower, freedom.upper]),
-                }
-                for freedom in item.freedoms
-            ]
+            data["freedoms"] = [_describe_freedom(freedom) for freedom in item.freedoms]
         elif item.freedoms:
-            data |= {"joint": item.joint, "axis": round_values(item.freedoms[0].axis, 12)}
-            data["limits"] = [item.freedoms[0].lower, item.freedoms[0].upper]
+            first = item.freedoms[0]
+            data["joint"] = item.joint
+            data["axis"] = round_values(first.axis, 12)
+            data["limits"] = [first.lower, first.upper]
         if item.joint == "cylindrical":
-            data["turn"] = [item.freedoms[1].lower, item.freedoms[1].upper]
+            _, turn = item.freedoms
+            data["turn"] = [turn.lower, turn.upper]
         if item.standoff:
             data["standoff"] = round(item.standoff, 5)
         if item.opening is not None:
             data["opening"] = round(item.opening, 5)
         return data
+
+
+def _describe_freedom(freedom: Freedom) -> dict[str, Any]:
+    """Return a degree of freedom as in an object's description file."""
+    motion = "slide" if freedom.kind == "prismatic" else "turn"
+    return {
+        "name": freedom.suffix.removeprefix("_"),
+        motion: freedom.axis.tolist(),
+        "limits": round_values([freedom.lower, freedom.upper]),
+    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,56 +121,39 @@ class Proposals:
         """
         index = self.object.coordinates.index(joint)
         closed = float(np.clip(0.0, self.object.lower[index], self.object.upper[index]))
-        ways = [way for way in self.opening(joint) if not (alone and way.when)]
-        reached = [way.opens[joint] for way in ways]
+        reached = list[float]()
+        for proposal in self.opening(joint):
+            if not (alone and proposal.when):
+                reached.append(proposal.opens[joint])
         return max(reached, key=lambda value: abs(value - closed), default=None)
 
     def _format_reached(self, index: int) -> str:
         """Format how far a hand can open a joint, if this is less than its range."""
-        joint, unit = self.object.coordinates.names[index], self.object.coordinates.units[index]
-        low, high = float(self.object.lower[index]), float(self.object.upper[index])
+        joint = self.object.coordinates.names[index]
+        unit = self.object.coordinates.units[index]
+        low = float(self.object.lower[index])
+        high = float(self.object.upper[index])
         goal = self.find_goal(joint)
         closed = float(np.clip(0.0, low, high))
         travel = max(high - closed, closed - low)
-        if goal is None or not np.isfinite(travel) or abs(goal - closed) >= (1.0 - 1e-3) * travel:
+        if goal is None or not np.isfinite(travel):
             return ""
-        share = abs(goal - closed) / travel
-        return f": a hand opens it to {goal:.3g} {unit}, {share:.0%} of its range"
+        opened = abs(goal - closed)
+        if opened >= _WHOLE * travel:
+            return ""
+        return f": a hand opens it to {goal:.3g} {unit}, {opened / travel:.0%} of its range"
 
     def summary(self) -> str:
         """Return a line for each attachment by joint, or the reason why it has none."""
-        lines = []
+        lines = list[str]()
         for index, joint in enumerate(self.object.coordinates.names):
-            low, high = self.object.lower[index], self.object.upper[index]
+            low = self.object.lower[index]
+            high = self.object.upper[index]
             unit = self.object.coordinates.units[index]
             lines.append(f"{joint}, {low:.3g} to {high:.3g} {unit}{self._format_reached(index)}")
-            for proposal in self.opening(joint):
-                handle = ", named as a handle" if proposal.named else ""
-                name = f"{proposal.attachment.name} ({proposal.kind}{handle})"
-                slide = next(
-                    (
-                        freedom
-                        for freedom in proposal.attachment.freedoms
-                        if freedom.kind == "prismatic"
-                    ),
-                    None,
-                )
-                free = (
-                    f", {1e3 * (slide.upper - slide.lower):.0f} mm to slide along" if slide else ""
-                )
-                when = _format_conditions(
-                    [f"{other} is at {value:.3g}" for other, value in proposal.when.items()]
-                )
-                wide = proposal.attachment.opening
-                narrow = "" if wide is None else f", fingers {1e3 * wide:.0f} mm apart"
-                thick = f"{1e3 * proposal.thickness:.0f} mm thick"
-                how = f"{thick}{narrow}, {proposal.attachment.joint}{free}"
-                if proposal.kind == "push":
-                    how = f"a face to push{free}"
-                lines.append(
-                    f"  {proposal.score:.2f}  {name}: {how}, "
-                    f"opens to {proposal.opens[joint]:.3g} {unit}{when}"
-                )
+            lines += [
+                f"  {_format_proposal(proposal, joint, unit)}" for proposal in self.opening(joint)
+            ]
             if joint in self.because:
                 lines.append(f"  no hand can open it: {self.because[joint]}")
         return "\n".join(lines)
@@ -173,9 +163,36 @@ def _format_conditions(conditions: list[str]) -> str:
     """Format the required positions of other joints as the end of a line."""
     if not conditions:
         return ""
-    more = (
-        f" and {len(conditions) - _MAX_LISTED} more joints are open"
-        if len(conditions) > _MAX_LISTED
-        else ""
-    )
-    return f", while {', '.join(conditions[:_MAX_LISTED])}{more}"
+    listed = ", ".join(conditions[:_MAX_LISTED])
+    if len(conditions) > _MAX_LISTED:
+        listed += f" and {len(conditions) - _MAX_LISTED} more joints are open"
+    return f", while {listed}"
+
+
+def _format_proposal(proposal: Proposal, joint: str, unit: str) -> str:
+    """Return a line about an attachment and how far it opens a joint.
+
+    Args:
+        proposal: The proposed attachment.
+        joint: The joint, one of `opens`.
+        unit: Unit of its position.
+    """
+    attachment = proposal.attachment
+    handle = ", named as a handle" if proposal.named else ""
+    slides = ""
+    for freedom in attachment.freedoms:
+        if freedom.kind == "prismatic":
+            slides = f", {1e3 * (freedom.upper - freedom.lower):.0f} mm to slide along"
+            break
+    if proposal.kind == "push":
+        how = f"a face to push{slides}"
+    else:
+        how = f"{1e3 * proposal.thickness:.0f} mm thick"
+        if attachment.opening is not None:
+            how += f", fingers {1e3 * attachment.opening:.0f} mm apart"
+        how += f", {attachment.joint}{slides}"
+    conditions = [f"{other} is at {value:.3g}" for other, value in proposal.when.items()]
+    when = _format_conditions(conditions)
+    name = f"{attachment.name} ({proposal.kind}{handle})"
+    opens = f"opens to {proposal.opens[joint]:.3g} {unit}"
+    return f"{proposal.score:.2f}  {name}: {how}, {opens}{when}"

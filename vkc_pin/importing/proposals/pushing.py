@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -17,6 +18,7 @@ _ALIGNED = 0.9  # smallest cosine between the inward normal and the motion of th
 _FRACTIONS = (0.5, 0.25, 0.75, 0.1, 0.9)  # relative positions on a face
 _LEVER = 0.1  # [m] smallest distance from a hinge
 _SLIDE = 0.1  # [m] largest slide to either side
+_NO_AREA = 1e-12  # [m²] up to which twice the area of a triangle counts as none
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,29 +52,31 @@ def find_pushes(piece: Piece, at: pin.SE3, opening: Opening, width: float) -> It
         half = (high - low) / 2.0
         if 4.0 * half[0] * half[1] < _AREA:
             continue
-        for fraction_x in _FRACTIONS:
-            for fraction_y in _FRACTIONS:
-                place = low + np.array([fraction_x, fraction_y]) * (high - low)
-                depth = float(corners[0] @ rotation[:, 2])
-                point = rotation @ np.append(place, depth)
-                motion, lever = _find_motion(opening, at.act(point))
-                alignment = float((at.rotation @ rotation[:, 2]) @ motion)
-                if alignment < _ALIGNED or lever < _LEVER:
-                    continue
-                most = min(_SLIDE, 0.5 * lever)
-                slide = (
-                    max(-most, min(0.0, low[0] - place[0] + width / 2.0)),
-                    min(most, max(0.0, high[0] - place[0] - width / 2.0)),
-                )
-                leverage = lever / max(opening.reach, 1e-3) if opening.turns else 1.0
-                middle = 1.0 - 0.4 * max(abs(fraction_x - 0.5), abs(fraction_y - 0.5))
-                yield Push(
-                    piece, pin.SE3(rotation, point), slide, alignment * min(leverage, 1.0) * middle
-                )
+        inward = rotation[:, 2]
+        depth = float(corners[0] @ inward)
+        for fraction_x, fraction_y in itertools.product(_FRACTIONS, _FRACTIONS):
+            place = low + np.array([fraction_x, fraction_y]) * (high - low)
+            point = rotation @ np.append(place, depth)
+            motion, lever = _find_motion(opening, at.act(point))
+            alignment = float((at.rotation @ inward) @ motion)
+            if alignment < _ALIGNED or lever < _LEVER:
+                continue
+            # The fingers stay on the face.
+            longest = min(_SLIDE, 0.5 * lever)
+            slide_low = max(-longest, min(0.0, low[0] - place[0] + width / 2.0))
+            slide_high = min(longest, max(0.0, high[0] - place[0] - width / 2.0))
+            leverage = lever / max(opening.reach, 1e-3) if opening.turns else 1.0
+            centrality = 1.0 - 0.4 * max(abs(fraction_x - 0.5), abs(fraction_y - 0.5))
+            quality = alignment * min(leverage, 1.0) * centrality
+            yield Push(piece, pin.SE3(rotation, point), (slide_low, slide_high), quality)
 
 
 def _find_motion(opening: Opening, point: Floats) -> tuple[Floats, float]:
-    """Return the direction in which a point moves, and its distance from a hinge [m]."""
+    """Return the direction in which a point moves, and its distance from a hinge [m].
+
+    With the hinge's unit axis a and the arm r from the axis to the point, the velocity is along
+    a × r.
+    """
     if not opening.turns:
         return opening.axis, np.inf
     arm = point - opening.origin
@@ -85,11 +89,14 @@ def _find_faces(piece: Piece) -> Iterator[tuple[Floats, Floats]]:
     """Yield the outward normal and the corners, shape (n, 3) [m], of each face of a piece."""
     triangles = piece.vertices[piece.faces]
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    areas = np.linalg.norm(normals, axis=1)
-    triangles, normals = triangles[areas > 1e-12], normals[areas > 1e-12]
+    has_area = np.linalg.norm(normals, axis=1) > _NO_AREA
+    triangles = triangles[has_area]
+    normals = normals[has_area]
     normals = normals / np.linalg.norm(normals, axis=1)[:, None]
+    # Of a convex piece, they point away from its middle.
     outward = np.einsum("ij,ij->i", normals, triangles[:, 0] - piece.vertices.mean(axis=0))
     normals *= np.where(outward < 0.0, -1.0, 1.0)[:, None]
+    # A face is all triangles of about the same normal.
     _, groups = np.unique(normals.round(3), axis=0, return_inverse=True)
     for group in range(groups.max(initial=-1) + 1):
         members = groups.ravel() == group

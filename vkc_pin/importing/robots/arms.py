@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ElementTree
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 
@@ -10,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.importing.description import MOVING_KINDS
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.words import list_words, split_words
 from vkc_pin.world.files.srdf import SrdfGroup
@@ -17,7 +19,6 @@ from vkc_pin.world.files.urdf import UrdfFile
 from vkc_pin.world.models.robot_model import build_full_model, find_joint_limits
 from vkc_pin.world.models.wheels import has_wheel_name
 
-_MOVING = ("revolute", "continuous", "prismatic")
 _FINGER = 7  # largest number of joints of a finger
 _ARM = 3  # smallest number of joints of an arm with a hand; one more without a hand
 _BESIDE = 0.5  # smallest length of a palm beside a jaw, relative to the jaw's
@@ -35,6 +36,7 @@ _OTHER_WORDS = list_words(
 )
 _SIDES = {"left": {"left", "l"}, "right": {"right", "r"}}
 _LONGEST_LIFT = 10.0  # [m] travel beyond which a vertical slide is no lift
+_MOST_GUESSES = 2  # arms without fingers or a name
 
 
 @dataclass(eq=False)
@@ -61,11 +63,9 @@ class Body:
     @property
     def is_planned(self) -> bool:
         """Whether the parent joint can be planned: it moves by one independent coordinate."""
-        return (
-            self.joint is not None
-            and self.joint.get("type") in _MOVING
-            and self.joint.find("mimic") is None
-        )
+        if self.joint is None:
+            return False
+        return self.joint.get("type") in MOVING_KINDS and self.joint.find("mimic") is None
 
     def path(self) -> list[Body]:
         """Return the bodies from the first one below the root to this one."""
@@ -73,7 +73,10 @@ class Body:
 
     def subtree(self) -> list[Body]:
         """Return this body and all its descendants."""
-        return [self, *(body for child in self.children for body in child.subtree())]
+        bodies = [self]
+        for child in self.children:
+            bodies += child.subtree()
+        return bodies
 
     def depth(self) -> int:
         """Return the largest number of planned joints on a path below this body."""
@@ -105,8 +108,8 @@ class Arm:
 
 def build_body_tree(file: UrdfFile) -> Body:
     """Return the root of a robot's tree of bodies."""
-    below: dict[str, list[ElementTree.Element]] = {}
-    children = set()
+    below = dict[str, list[ElementTree.Element]]()
+    children = set[str]()
     for joint in file.root.findall("joint"):
         below.setdefault(_get_link(joint, "parent"), []).append(joint)
         children.add(_get_link(joint, "child"))
@@ -114,12 +117,14 @@ def build_body_tree(file: UrdfFile) -> Body:
     waiting = [root]
     while waiting:
         body = waiting.pop(0)
-        for link in body.links:  # the list grows in the loop
+        # The list grows in the loop.
+        for link in body.links:
             for joint in below.get(link, ()):
+                child = _get_link(joint, "child")
                 if joint.get("type") == "fixed":
-                    body.links.append(_get_link(joint, "child"))
+                    body.links.append(child)
                 else:
-                    body.children.append(Body([_get_link(joint, "child")], joint, body))
+                    body.children.append(Body([child], joint, body))
         waiting += body.children
     return root
 
@@ -133,18 +138,22 @@ def find_own_base(file: UrdfFile, root: Body, solid: Set[str]) -> tuple[str, ...
     they carry the wheels.
     """
     full = build_full_model(file)
-    data, joints, body = full.createData(), list[str](), root
+    data = full.createData()
     pin.computeJointJacobians(full, data, pin.neutral(full))
     carries_wheels = any(has_wheel_name(joint) for joint in file.root.findall("joint"))
+    joints = list[str]()
+    body = root
     while len(body.children) == 1 and not solid & set(body.links):
         body = body.children[0]
         number = full.getJointId(body.name)
         if full.joints[number].nv != 1:
             break
+        # The joint's column of the Jacobian (v, ω) along the world's axes; the third one is up.
         jacobian = pin.getJointJacobian(full, data, number, pin.LOCAL_WORLD_ALIGNED)
         slide, turn = np.split(np.abs(jacobian[:, full.joints[number].idx_v]), 2)
-        slides_level = not turn.any() and slide[2] < _LEVEL
-        slides_far = not turn.any() and np.ptp(find_joint_limits(full, body.name)) > _LONGEST_LIFT
+        is_slide = not turn.any()
+        slides_level = is_slide and slide[2] < _LEVEL
+        slides_far = is_slide and np.ptp(find_joint_limits(full, body.name)) > _LONGEST_LIFT
         turns_upright = turn[2] > 1.0 - _LEVEL
         if not (slides_level or slides_far or turns_upright or carries_wheels):
             break
@@ -162,47 +171,78 @@ def find_arms(
     are not named as legs, heads or wheels.
     """
     base = find_own_base(file, root, solid)
-    everything, arms = root.subtree(), []
-    palms: list[Body] = []
-    for body in everything:
-        if (
-            any(above in palms for above in body.path()[:-1])
-            or len(_find_planned_joints(body, base)) < _ARM
-        ):
-            continue
-        if _is_palm(body, file):
-            palms.append(body)
-    inside = {id(below) for palm in palms for below in palm.subtree()}
-    carrying = {id(above) for palm in palms for above in palm.path()}
-    tips = [body for body in everything if not body.children and id(body) not in inside | carrying]
+    palms = _find_palms(root, base, file)
+    tips = _find_tips(root, palms)
+    arms = list[Arm]()
     for body in palms + tips:
-        fingers = _find_fingers(body, solid)
         joints = _find_planned_joints(body, base)
-        own = [*joints[-5:], *body.links[:2]]
-        other = sum(_has_word(name, _OTHER_WORDS) for name in own)
-        words = sum(_has_word(name, _ARM_WORDS) for name in own)
-        if not joints or other > words or (body in tips and (len(joints) <= _ARM or other)):
+        own_names = [*joints[-5:], *body.links[:2]]
+        other_words = sum(_has_word(name, _OTHER_WORDS) for name in own_names)
+        arm_words = sum(_has_word(name, _ARM_WORDS) for name in own_names)
+        if not joints or other_words > arm_words:
             continue
-        score = 3.0 * bool(fingers) + 2.0 * bool(words) + min(len(joints), 7) / 7.0
-        sure = (
-            "sure"
-            if fingers and words and len(joints) > _ARM
-            else "likely"
-            if fingers or words
-            else "guess"
-        )
-        why = f"{len(joints)} joints, " + (f"{len(fingers)} fingers" if fingers else "no fingers")
-        why += ", named as an arm" if words else ""
-        arms.append(
-            Arm(_choose_name(joints, body, groups), joints, body, fingers, sure, why, score)
-        )
-    if sum(arm.sure == "guess" for arm in arms) > 2:  # fingers of a hand, legs
+        if body in tips and (len(joints) <= _ARM or other_words):
+            continue
+        fingers = _find_fingers(body, solid)
+        arms.append(_rate_arm(joints, body, fingers, groups, is_named=arm_words > 0))
+    # More of them are fingers of a hand, or legs.
+    if sum(arm.sure == "guess" for arm in arms) > _MOST_GUESSES:
         arms = [arm for arm in arms if arm.sure != "guess"]
     arms.sort(key=lambda arm: -arm.score)
-    names = [arm.name for arm in arms]
-    return [
-        arm if names.count(arm.name) == 1 else replace(arm, name=arm.palm.links[0]) for arm in arms
-    ]
+    counts = Counter(arm.name for arm in arms)
+    for k, arm in enumerate(arms):
+        if counts[arm.name] > 1:
+            arms[k] = replace(arm, name=arm.palm.links[0])
+    return arms
+
+
+def _find_palms(root: Body, base: Collection[str], file: UrdfFile) -> list[Body]:
+    """Return the first bodies with fingers below at least three joints of an arm."""
+    palms = list[Body]()
+    for body in root.subtree():
+        is_inside = any(above in palms for above in body.path()[:-1])
+        is_far = len(_find_planned_joints(body, base)) >= _ARM
+        if not is_inside and is_far and _is_palm(body, file):
+            palms.append(body)
+    return palms
+
+
+def _find_tips(root: Body, palms: Sequence[Body]) -> list[Body]:
+    """Return the last bodies of chains without a palm."""
+    of_palms = set[int]()
+    for palm in palms:
+        of_palms.update(map(id, palm.subtree()))
+        of_palms.update(map(id, palm.path()))
+    return [body for body in root.subtree() if not body.children and id(body) not in of_palms]
+
+
+def _rate_arm(
+    joints: tuple[str, ...],
+    palm: Body,
+    fingers: tuple[Body, ...],
+    groups: Mapping[str, SrdfGroup],
+    *,
+    is_named: bool,
+) -> Arm:
+    """Return an arm with confidence, evidence and rank: fingers count most, then its name."""
+    score = 0.0
+    why = f"{len(joints)} joints, {_count_fingers(fingers)}"
+    if fingers:
+        score += 3.0
+    if is_named:
+        score += 2.0
+        why += ", named as an arm"
+    score += min(len(joints), 7) / 7.0
+    sure = "guess"
+    if fingers and is_named and len(joints) > _ARM:
+        sure = "sure"
+    elif fingers or is_named:
+        sure = "likely"
+    return Arm(_choose_name(joints, palm, groups), joints, palm, fingers, sure, why, score)
+
+
+def _count_fingers(fingers: Sequence[Body]) -> str:
+    return f"{len(fingers)} fingers" if fingers else "no fingers"
 
 
 def choose_arm(
@@ -233,26 +273,22 @@ def choose_arm(
         return arms[0]
     fitting = [arm for arm in arms if arm.name == name]
     if group is not None:
-        members = set(group.joints)
-        fitting = fitting or [arm for arm in arms if _get_last_joints(arm.joints) <= members]
         stated = _make_arm_of_group(name, group, file, root, solid)
-        fitting = fitting or [arm for arm in arms if stated and arm.palm.links == stated.palm.links]
+        if not fitting:
+            fitting = [arm for arm in arms if _has_arm(group, arm)]
+        if not fitting and stated is not None:
+            fitting = [arm for arm in arms if arm.palm.links == stated.palm.links]
         if stated is not None:
             fitting.append(stated)
-    fitting = fitting or [arm for arm in arms if name.lower() in arm.name.lower()]
     if not fitting:
-        also = [
-            other
-            for other, listed in groups.items()
-            if any(_get_last_joints(arm.joints) <= set(listed.joints) for arm in arms)
-        ]
-        raise UnknownNameError(
-            "arm",
-            name,
-            dict.fromkeys([*(arm.name for arm in arms), *also]),
-            file=file.path,
-            field="arm",
-        )
+        fitting = [arm for arm in arms if name.lower() in arm.name.lower()]
+    if not fitting:
+        names = [arm.name for arm in arms]
+        for other, listed in groups.items():
+            if any(_has_arm(listed, arm) for arm in arms):
+                names.append(other)
+        known = dict.fromkeys(names)
+        raise UnknownNameError("arm", name, known, file=file.path, field="arm")
     return fitting[0]
 
 
@@ -267,18 +303,17 @@ def _make_arm_of_group(
     if not joints:
         return None
     fingers = _find_fingers(palm, solid) if palms else ()
-    count = f"{len(fingers)} fingers" if fingers else "no fingers"
-    why = f"{len(joints)} joints, {count}, a group of the SRDF"
+    why = f"{len(joints)} joints, {_count_fingers(fingers)}, a group of the SRDF"
     return Arm(name, joints, palm, fingers, "sure", why, 0.0)
 
 
 def _find_fingers(palm: Body, solid: Set[str]) -> tuple[Body, ...]:
     """Return the first bodies of the fingers with shapes."""
-    return tuple(
-        child
-        for child in palm.children
-        if any(solid & set(below.links) for below in child.subtree())
-    )
+    fingers = list[Body]()
+    for child in palm.children:
+        if any(solid & set(below.links) for below in child.subtree()):
+            fingers.append(child)
+    return tuple(fingers)
 
 
 def find_telescopes(full: pin.Model, joints: Sequence[str]) -> list[tuple[str, ...]]:
@@ -286,27 +321,38 @@ def find_telescopes(full: pin.Model, joints: Sequence[str]) -> list[tuple[str, .
 
     One motor moves all segments of a telescope.
     """
-    data, telescopes = full.createData(), list[list[str]]()
+    data = full.createData()
     pin.forwardKinematics(full, data, pin.neutral(full))
-    before, along = 0, np.zeros(3)
+    telescopes = list[list[str]]()
+    before = 0
+    axis_before = np.zeros(3)
     for name in joints:
         number = full.getJointId(name)
-        # The axis is zero for revolute joints.
-        axis = data.oMi[number].rotation @ np.asarray(data.joints[number].S, float).ravel()[:3]
-        bounds = (full.lowerPositionLimit, full.upperPositionLimit)
-        if (
-            full.parents[number] == before
-            and axis @ along > _PARALLEL
-            and all(
-                np.isclose(bound[full.joints[number].idx_q], bound[full.joints[before].idx_q])
-                for bound in bounds
-            )
-        ):
+        # The joint's motion in its own frame is (v, ω), with v = 0 for revolute joints.
+        motion = np.asarray(data.joints[number].S, float).ravel()
+        axis = data.oMi[number].rotation @ motion[:3]
+        is_next = full.parents[number] == before
+        is_parallel = axis @ axis_before > _PARALLEL
+        if is_next and is_parallel and _have_equal_limits(full, number, before):
             telescopes[-1].append(name)
         else:
             telescopes.append([name])
-        before, along = number, axis
+        before = number
+        axis_before = axis
     return [tuple(group) for group in telescopes if len(group) > 1]
+
+
+def _have_equal_limits(full: pin.Model, joint: int, other: int) -> bool:
+    k = full.joints[joint].idx_q
+    other_k = full.joints[other].idx_q
+    for bound in (full.lowerPositionLimit, full.upperPositionLimit):
+        if not np.isclose(bound[k], bound[other_k]):
+            return False
+    return True
+
+
+def _has_arm(group: SrdfGroup, arm: Arm) -> bool:
+    return _get_last_joints(arm.joints) <= set(group.joints)
 
 
 def _get_last_joints(joints: Sequence[str]) -> set[str]:
@@ -316,26 +362,21 @@ def _get_last_joints(joints: Sequence[str]) -> set[str]:
 
 def _is_palm(body: Body, file: UrdfFile) -> bool:
     """Return whether a body has fingers: two or more, or one that is named as a jaw."""
-    if (
-        not body.children
-        or body.depth() > _FINGER
-        or not any(below.is_planned for below in body.subtree()[1:])
-    ):
+    if not body.children or body.depth() > _FINGER:
+        return False
+    if not any(below.is_planned for below in body.subtree()[1:]):
         return False
     names = [f"{child.name} {child.links[0]}" for child in body.children]
     # A finger may have its arm's name before its own.
     if any(_has_word(name, _TRUNK_WORDS) and not _has_word(name, _HAND_WORDS) for name in names):
         return False
     if len(body.children) == 1:
-        jaw = body.children[0]
-        return (
-            _has_word(names[0], _HAND_WORDS)
-            and not _has_word(jaw.name, _WRIST_WORDS)
-            and not jaw.children
-            and _has_jaw_beside(body, jaw, file)
-        )
-    named = any(_has_word(name, _HAND_WORDS) for name in names)
-    return named or not any(_has_word(name, _OTHER_WORDS) for name in names)
+        (jaw,) = body.children
+        is_named = _has_word(names[0], _HAND_WORDS) and not _has_word(jaw.name, _WRIST_WORDS)
+        return is_named and not jaw.children and _has_jaw_beside(body, jaw, file)
+    if any(_has_word(name, _HAND_WORDS) for name in names):
+        return True
+    return not any(_has_word(name, _OTHER_WORDS) for name in names)
 
 
 def _has_word(name: str, words: Set[str]) -> bool:
@@ -345,33 +386,40 @@ def _has_word(name: str, words: Set[str]) -> bool:
 def _has_jaw_beside(palm: Body, jaw: Body, file: UrdfFile) -> bool:
     """Return whether a palm extends beside a jaw, which closes against it, rather than behind it.
 
-    What turns about its own length, such as the last link of a wrist, is no jaw.
+    What turns about its own length, such as the last link of a wrist, is no jaw. With points from
+    the jaw's joint on, d is the direction to the jaw's centre across its axis a; a palm extends at
+    least half as far as the jaw in one of the directions to which the jaw turns, exp(θ a) d.
     """
     full = build_full_model(file)
     data = full.createData()
     pin.framesForwardKinematics(full, data, pin.neutral(full))
-    points = {
-        link: corners @ place.rotation.T + place.translation
-        for link, corners in sample_points(file, [*palm.links, *jaw.links]).items()
-        for place in (data.oMf[full.getFrameId(link, pin.FrameType.BODY)],)
-    }
-    own, others = ([points[link] for link in body.links if link in points] for body in (jaw, palm))
-    if not (own and others):
+    points = sample_points(file, [*palm.links, *jaw.links])
+    for link, corners in points.items():
+        place = data.oMf[full.getFrameId(link, pin.FrameType.BODY)]
+        points[link] = corners @ place.rotation.T + place.translation
+    of_jaw = [points[link] for link in jaw.links if link in points]
+    of_palm = [points[link] for link in palm.links if link in points]
+    if not (of_jaw and of_palm):
         return False
     number = full.getJointId(jaw.name)
-    base, motion = data.oMi[number], np.asarray(data.joints[number].S, float).ravel()
-    axis = base.rotation @ (motion[3:] if motion[3:].any() else np.zeros(3))
-    ahead = np.vstack(own) - base.translation
+    base = data.oMi[number]
+    motion = np.asarray(data.joints[number].S, float).ravel()
+    # It is zero for a jaw that slides.
+    axis = base.rotation @ motion[3:]
+    ahead = np.vstack(of_jaw) - base.translation
     centre = ahead.mean(axis=0)
     across = centre - (centre @ axis) * axis
     if np.linalg.norm(across) < abs(centre @ axis):
         return False
     across /= np.linalg.norm(across)
     reach = float((ahead @ across).max())
-    beside = np.vstack(others) - base.translation
+    beside = np.vstack(of_palm) - base.translation
     # A palm lies where the jaw turns to rather than where it is.
-    towards = [pin.exp3(angle * axis) @ across for angle in _JAW_ANGLES]
-    return max(float((beside @ one).max()) for one in towards) > _BESIDE * reach
+    extents = list[float]()
+    for angle in _JAW_ANGLES:
+        direction = pin.exp3(angle * axis) @ across
+        extents.append(float((beside @ direction).max()))
+    return max(extents) > _BESIDE * reach
 
 
 def _find_planned_joints(body: Body, base: Collection[str]) -> tuple[str, ...]:
@@ -385,7 +433,8 @@ def _choose_name(joints: Sequence[str], palm: Body, groups: Mapping[str, SrdfGro
     if fitting:
         return min(fitting, key=lambda name: (len(groups[name].joints), name))
     for side, words in _SIDES.items():
-        if sum(_has_word(name, words) for name in [*joints[-3:], palm.links[0]]) >= 2:
+        count = sum(_has_word(name, words) for name in [*joints[-3:], palm.links[0]])
+        if count > 1:
             return side
     return palm.links[0]
 
@@ -394,21 +443,25 @@ def sample_points(file: UrdfFile, links: Sequence[str]) -> dict[str, Floats]:
     """Return points on links, shape (n, 3) in the link's frame [m]."""
     from trimesh.sample import sample_surface
 
-    points_by_link: dict[str, Floats] = {}
+    points_by_link = dict[str, Floats]()
+    # Visual shapes count on links without collision shapes.
     for kind in ("collision", "visual"):
-        new: dict[str, list[Floats]] = {}
+        new = dict[str, list[Floats]]()
         for shape in file.read_shapes(kind):
-            if shape.link in links and shape.link not in points_by_link:
-                try:
-                    mesh = shape.make_mesh()
-                except InputError:
-                    continue
-                corners = np.asarray(mesh.vertices)
-                # `Trimesh.sample` takes a seed from trimesh 5 on only.
-                sampled = np.asarray(sample_surface(mesh, _POINTS, seed=0)[0])
-                step = max(1, len(corners) // _POINTS)
-                new.setdefault(shape.link, []).append(np.vstack([corners[::step], sampled]))
-        points_by_link.update({link: np.vstack(points) for link, points in new.items()})
+            if shape.link not in links or shape.link in points_by_link:
+                continue
+            try:
+                mesh = shape.make_mesh()
+            except InputError:
+                continue
+            corners = np.asarray(mesh.vertices)
+            # `Trimesh.sample` takes a seed from trimesh 5 on only.
+            sampled, _ = sample_surface(mesh, _POINTS, seed=0)
+            step = max(1, len(corners) // _POINTS)
+            points = np.vstack([corners[::step], np.asarray(sampled)])
+            new.setdefault(shape.link, []).append(points)
+        for link, parts in new.items():
+            points_by_link[link] = np.vstack(parts)
     return points_by_link
 
 

@@ -30,20 +30,25 @@ from vkc_pin.world.models.robot_model import (
 Positions = Mapping[str, float]  # of joints by name, [m] or [rad]
 
 _TIP = 0.025  # [m] length of a fingertip
-_PAD = 0.02  # [m] distance of the grasped object behind the fingertips,
-_SHARE = 0.3  # at most this fraction of a finger's length
+# Distance of the grasped object behind the fingertips: [m], and at most this fraction of a finger
+_PAD = 0.02
+_SHARE = 0.3
 _SNAP = np.cos(np.radians(12.0))  # closer directions snap to an axis of the hand
 _ALIGNED = 0.7  # cosine between the axis of a wrist that rolls and the approach
 _ROD = 0.036  # [m] thickness of a lever, with clearance on both sides
-# Shifts of a tool frame without room for such a rod [m], along its z and x axes
-_AHEAD, _ASIDE = (0.0, 0.005, 0.01, 0.015, 0.02, 0.03), (0.0, -0.01, 0.01, -0.02, 0.02)
+# Shifts of a tool frame without room for such a rod [m]
+_AHEAD = (0.0, 0.005, 0.01, 0.015, 0.02, 0.03)  # along its z axis
+_ASIDE = (0.0, -0.01, 0.01, -0.02, 0.02)  # along its x axis
 _LITTLE_ROOM = 0.002  # [m] smallest gain for which it is shifted
 _SHARES = (0.75, 0.5)  # of the opening, at which rotating jaws may have more room
 _ENCLOSED = 0.005  # [m] by which fingers extend beyond the tool frame
 _STUB = 0.3  # shorter fingers, relative to the longest, are parts of a drive
 _GRIPPER = 3  # largest number of fingers of a gripper, all of which close together
 _LITTLE = 1e-6  # [m] or [rad] smallest travel between open and closed
+_MOVES = 0.01  # [m] smallest difference of gaps by which fingers open
+_AT_JOINT = 0.01  # [m] from its joint, within which the frame of a last link is at the joint
 _PASSES = 2  # passes over the fingers' joints
+_MOST_DIVIDED = 8  # fingers whose groups are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,16 +79,16 @@ class Hand:
 
     def settings(self) -> dict[str, Any]:
         """Return the fingers' settings for robot.yaml: the gripper's joints, and locked joints."""
-        opened = {joint: round(value, 6) for joint, value in self.open.items()}
-        gripper = {
-            joint: {"closed": round(value, 6), "open": opened.pop(joint)}
-            for joint, value in self.closed.items()
-        }
-        return {
-            key: setting
-            for key, setting in (("locked_joints", opened), ("gripper", gripper))
-            if setting
-        }
+        locked = {joint: round(value, 6) for joint, value in self.open.items()}
+        gripper = dict[str, dict[str, float]]()
+        for joint, value in self.closed.items():
+            gripper[joint] = {"closed": round(value, 6), "open": locked.pop(joint)}
+        settings = dict[str, Any]()
+        if locked:
+            settings["locked_joints"] = locked
+        if gripper:
+            settings["gripper"] = gripper
+        return settings
 
 
 def analyze_hand(
@@ -106,26 +111,28 @@ class _HandAnalysis:
         self, file: UrdfFile, full: pin.Model, arm: Arm, linkages: Sequence[Sequence[Positions]]
     ) -> None:
         self._linkages = linkages
-        self._file, self._full, self._arm, self._data = file, full, arm, full.createData()
-        self._points = sample_points(
-            file, [link for body in arm.palm.subtree() for link in body.links]
-        )
+        self._file = file
+        self._full = full
+        self._arm = arm
+        self._data = full.createData()
+        links = list[str]()
+        for body in arm.palm.subtree():
+            links += body.links
+        self._points = sample_points(file, links)
+        self._touch_links = tuple(link for link in links if link in self._points)
         self._link = arm.palm.links[0]
         self._palm = full.getFrameId(self._link, pin.FrameType.BODY)
 
     def run(self) -> Hand:
         """Return the geometry of the hand."""
         reach = {finger: self._measure_reach(finger) for finger in self._arm.fingers}
-        fingers = [
-            finger for finger in self._arm.fingers if reach[finger] > _STUB * max(reach.values())
-        ]
-        touch = tuple(
-            link for body in self._arm.palm.subtree() for link in body.links if link in self._points
-        )
-        if not fingers or (
-            len(fingers) == 1 and not len(self._find_points(self._arm.palm, {}, alone=True))
-        ):
-            return self._use_flange(touch)
+        longest = max(reach.values(), default=0.0)
+        fingers = [finger for finger in self._arm.fingers if reach[finger] > _STUB * longest]
+        if not fingers:
+            return self._use_flange()
+        # One jaw needs a palm against which it closes.
+        if len(fingers) == 1 and not len(self._find_points(self._arm.palm, {}, alone=True)):
+            return self._use_flange()
         joints = self._find_finger_joints(fingers)
         # One motor with <mimic> joints moves a linkage of fingers and of bars beside them.
         is_driven = len(joints) == 1 and len(fingers) > _GRIPPER
@@ -133,35 +140,35 @@ class _HandAnalysis:
         first, second = self._divide_fingers(fingers)
         if is_driven:
             first, second = self._divide_by_motion(fingers, joints[0]) or (first, second)
-            first, second = self._leave_out_bars(first), self._leave_out_bars(second)
+            first = self._leave_out_bars(first)
+            second = self._leave_out_bars(second)
             fingers = [*first, *second]
-        opened, closed_positions, gap, closed = self._find_opening(first, second, joints)
-        linked = {name for linkage in self._linkages for name in linkage[0]}
-        tool, opened = self._place_tool(first, second, opened, closed_positions, linked)
+        opened, closed, closed_gap = self._find_opening(first, second, joints)
+        linked = set[str]()
+        for linkage in self._linkages:
+            linked.update(linkage[0])
+        tool, opened = self._place_tool(first, second, opened, closed, linked)
         gap = self._measure_gap(first, second, opened)
-        moves = gap - closed
         is_linkage = is_driven or (bool(linked) and linked.issuperset(joints))
-        sure = (
-            "sure" if len(fingers) == 2 and moves > 0.01 else "likely" if moves > 0.01 else "guess"
-        )
-        how = (
-            "the fingers of a linkage"
-            if is_linkage
-            else "two fingers"
-            if len(fingers) == 2
-            else "one jaw and the hand"
-            if len(fingers) == 1
-            else f"{len(fingers)} fingers"
-        )
-        why = f"between {how}, which open from {1e3 * closed:.0f} to {1e3 * gap:.0f} mm"
-        closing_joints = {
-            joint: value
-            for joint, value in closed_positions.items()
-            if abs(value - opened[joint]) > _LITTLE
-        }
-        known = moves > 0.01 and (is_linkage or len(fingers) <= _GRIPPER)
+        moves = gap - closed_gap > _MOVES
+        sure = "guess"
+        if moves:
+            sure = "sure" if len(fingers) == 2 else "likely"
+        closing_joints = dict[str, float]()
+        if moves and (is_linkage or len(fingers) <= _GRIPPER):
+            for joint, value in closed.items():
+                if abs(value - opened[joint]) > _LITTLE:
+                    closing_joints[joint] = value
+        how = _describe_fingers(len(fingers), is_linkage=is_linkage)
         return Hand(
-            self._link, tool, opened, closing_joints if known else {}, float(gap), touch, sure, why
+            link=self._link,
+            tool=tool,
+            open=opened,
+            closed=closing_joints,
+            opening=float(gap),
+            touch_links=self._touch_links,
+            sure=sure,
+            why=f"between {how}, which open from {1e3 * closed_gap:.0f} to {1e3 * gap:.0f} mm",
         )
 
     def _find_finger_joints(self, fingers: Sequence[Body]) -> list[str]:
@@ -177,30 +184,36 @@ class _HandAnalysis:
     def _divide_by_motion(
         self, fingers: Sequence[Body], driver: str
     ) -> tuple[list[Body], list[Body]] | None:
-        """Return the fingers that one joint moves to either side, or None if all go one way."""
-        ends = [
-            [self._find_points(finger, {driver: limit}).mean(axis=0) for finger in fingers]
-            for limit in find_joint_limits(self._full, driver)
-            if np.isfinite(limit)
-        ]
-        if len(ends) < 2:
+        """Return the fingers that one joint moves to either side, or None if all move alike."""
+        low, high = find_joint_limits(self._full, driver)
+        if not np.isfinite([low, high]).all():
             return None
-        motions = np.array(ends[1]) - np.array(ends[0])
+        centres_at_low = self._find_centres(fingers, {driver: low})
+        centres_at_high = self._find_centres(fingers, {driver: high})
+        motions = centres_at_high - centres_at_low
         # Most of the motion is in one direction, after that of all fingers together is subtracted.
         apart = motions - motions.mean(axis=0)
-        direction = np.linalg.svd(apart)[2][0]
-        first = [
-            finger
-            for finger, motion in zip(fingers, apart, strict=True)
-            if motion @ direction > 0.0
-        ]
-        second = [finger for finger in fingers if finger not in first]
+        _, _, directions = np.linalg.svd(apart)
+        direction = directions[0]
+        first = list[Body]()
+        second = list[Body]()
+        for finger, motion in zip(fingers, apart, strict=True):
+            side = first if motion @ direction > 0.0 else second
+            side.append(finger)
         return (first, second) if first and second else None
+
+    def _find_centres(self, fingers: Sequence[Body], positions: Positions) -> Floats:
+        """Return the mean of each finger's points in the palm's frame, shape (n, 3) [m]."""
+        return np.array([self._find_points(finger, positions).mean(axis=0) for finger in fingers])
 
     def _leave_out_bars(self, fingers: Sequence[Body]) -> list[Body]:
         """Return the fingers on one side whose tips are foremost: bars of a linkage end before."""
-        tips = [float((self._find_fingertip(one, {}) @ self._approach).max()) for one in fingers]
-        return [one for one, tip in zip(fingers, tips, strict=True) if tip > max(tips) - _TIP]
+        tips = list[float]()
+        for finger in fingers:
+            tips.append(float((self._find_fingertip(finger, {}) @ self._approach).max()))
+        foremost = max(tips, default=0.0)
+        kept = zip(fingers, tips, strict=True)
+        return [finger for finger, tip in kept if tip > foremost - _TIP]
 
     def _place(self, positions: Mapping[str, float]) -> pin.SE3:
         """Set joint positions, and return the palm's placement."""
@@ -213,56 +226,51 @@ class _HandAnalysis:
     ) -> Floats:
         """Return points of a body and its descendants in the palm's frame, shape (n, 3) [m]."""
         palm = self._place(positions)
-        points_by_link = [np.zeros((0, 3))]
+        placed = [np.zeros((0, 3))]
         for part in [body] if alone else body.subtree():
             for link in part.links:
                 if link in self._points:
-                    place = palm.actInv(
-                        self._data.oMf[self._full.getFrameId(link, pin.FrameType.BODY)]
-                    )
-                    points_by_link.append(self._points[link] @ place.rotation.T + place.translation)
-        return np.vstack(points_by_link)
+                    place = palm.actInv(self._data.oMf[self._get_frame(link)])
+                    placed.append(self._points[link] @ place.rotation.T + place.translation)
+        return np.vstack(placed)
+
+    def _get_frame(self, link: str) -> int:
+        return int(self._full.getFrameId(link, pin.FrameType.BODY))
 
     def _divide_fingers(self, fingers: Sequence[Body]) -> tuple[list[Body], list[Body]]:
         """Return two groups of fingers that close against each other."""
         if len(fingers) == 1:
             return list(fingers), []
-        thumbs = [
-            finger
-            for finger in fingers
-            if any("thumb" in split_words(link) for body in finger.subtree() for link in body.links)
-        ]
+        thumbs = [finger for finger in fingers if _is_thumb(finger)]
         if thumbs and len(thumbs) < len(fingers):
             return thumbs, [finger for finger in fingers if finger not in thumbs]
-        centres = np.array([self._find_points(finger, {}).mean(axis=0) for finger in fingers[:8]])
-        best, chosen = np.inf, tuple[int, ...]((0,))
+        # The two groups whose fingers are closest to each other
+        centres = self._find_centres(fingers[:_MOST_DIVIDED], {})
+        numbers = range(len(centres))
+        least_spread = np.inf
+        chosen: tuple[int, ...] = (0,)
         for size in range(1, len(centres) // 2 + 1):
-            for group in itertools.combinations(range(len(centres)), size):
-                others = [k for k in range(len(centres)) if k not in group]
-                spread = sum(
-                    ((centres[part] - centres[part].mean(axis=0)) ** 2).sum()
-                    for part in (list(group), others)
-                )
-                if spread < best:
-                    best, chosen = float(spread), group
+            for group in itertools.combinations(numbers, size):
+                others = [k for k in numbers if k not in group]
+                spread = _measure_spread(centres[list(group)]) + _measure_spread(centres[others])
+                if spread < least_spread:
+                    least_spread = spread
+                    chosen = group
         first = [finger for k, finger in enumerate(fingers) if k in chosen]
-        return first, [finger for k, finger in enumerate(fingers) if k not in chosen]
+        second = [finger for k, finger in enumerate(fingers) if k not in chosen]
+        return first, second
 
     def _measure_reach(self, finger: Body) -> float:
         """Return the largest distance of a finger's points from its joint [m]; 0 without shapes."""
         points = self._find_points(finger, {})
-        return (
-            float(np.linalg.norm(points - self._find_base(finger), axis=1).max())
-            if len(points)
-            else 0.0
-        )
+        distances = np.linalg.norm(points - self._find_base(finger), axis=1)
+        return float(distances.max(initial=0.0))
 
     def _find_base(self, finger: Body) -> Floats:
         """Return the current position of a finger's first joint in the palm's frame, shape (3,)."""
         palm = self._data.oMf[self._palm]
-        return np.asarray(
-            palm.actInv(self._data.oMi[self._full.getJointId(finger.name)]).translation
-        )
+        joint = self._data.oMi[self._full.getJointId(finger.name)]
+        return np.asarray(palm.actInv(joint).translation)
 
     def _find_fingertip(self, finger: Body, positions: Mapping[str, float]) -> Floats:
         """Return the points of a finger's last body that are furthest from its first joint."""
@@ -276,61 +284,61 @@ class _HandAnalysis:
         """Return the distance between the fingertips of two groups [m]."""
         from scipy.spatial import cKDTree
 
-        a = np.vstack([self._find_fingertip(finger, positions) for finger in first])
+        own = np.vstack([self._find_fingertip(finger, positions) for finger in first])
         if second:
-            b = np.vstack([self._find_fingertip(finger, positions) for finger in second])
+            others = np.vstack([self._find_fingertip(finger, positions) for finger in second])
         else:
-            b = self._find_points(self._arm.palm, positions, alone=True)
-            along = b @ self._approach
-            b = b[along >= along.max() - min(2.0 * _TIP, _SHARE * float(np.ptp(along)))]
-        return float(cKDTree(a).query(b)[0].min())
+            # One jaw closes against the end of the palm.
+            others = self._find_points(self._arm.palm, positions, alone=True)
+            along = others @ self._approach
+            depth = min(2.0 * _TIP, _SHARE * float(np.ptp(along)))
+            others = others[along >= along.max() - depth]
+        distances, _ = cKDTree(own).query(others)
+        return float(distances.min())
 
     def _find_opening(
         self, first: Sequence[Body], second: Sequence[Body], joints: Sequence[str]
-    ) -> tuple[dict[str, float], dict[str, float], float, float]:
-        """Return open and closed positions of the finger joints, and the gaps there [m]."""
+    ) -> tuple[dict[str, float], dict[str, float], float]:
+        """Return open and closed positions of the finger joints, and the smallest gap [m]."""
         rest = compute_rest_positions(self._full, self._file, {})
-        chosen = {joint: rest[joint] for joint in joints if joint in rest}
-        choices = self._list_choices(chosen)
-        best = smallest = self._measure_gap(first, second, chosen)
+        opened = {joint: rest[joint] for joint in joints if joint in rest}
+        choices = self._list_choices(opened)
+        largest = self._measure_gap(first, second, opened)
+        smallest = largest
         for _ in range(_PASSES if len(choices) > 1 else 1):
             for positions in choices:
                 for choice in positions:
-                    gap = self._measure_gap(first, second, {**chosen, **choice})
+                    gap = self._measure_gap(first, second, {**opened, **choice})
                     smallest = min(smallest, gap)
-                    if gap > best + 1e-4:
-                        best = gap
-                        chosen.update(choice)
-        closed_positions = dict[str, float]()
+                    if gap > largest + 1e-4:
+                        largest = gap
+                        opened.update(choice)
+
+        # Closed are the positions furthest from the open ones.
+        closed = dict[str, float]()
         for positions in choices:
-            furthest: Positions = max(
-                positions,
-                key=lambda choice: max(abs(choice[name] - chosen[name]) for name in choice),
-            )
-            closed_positions.update(furthest)
-        return (
-            chosen,
-            closed_positions,
-            best,
-            min(smallest, self._measure_gap(first, second, closed_positions)),
-        )
+            travels = [_measure_travel(opened, choice) for choice in positions]
+            closed.update(positions[int(np.argmax(travels))])
+        smallest = min(smallest, self._measure_gap(first, second, closed))
+        return opened, closed, smallest
 
     def _list_choices(self, rest: Positions) -> list[list[dict[str, float]]]:
         """Return the positions to try for each finger joint, and those of each linkage."""
-        choices, left = list[list[dict[str, float]]](), dict(rest)
+        choices = list[list[dict[str, float]]]()
+        left = dict(rest)
         for linkage in self._linkages:
             names = [name for name in linkage[0] if name in left]
             if names:
                 choices.append([{name: state[name] for name in names} for state in linkage])
                 for name in names:
                     left.pop(name)
-        return choices + [
-            [{joint: value} for value in self._sample_positions(joint, position)]
-            for joint, position in left.items()
-        ]
+        for joint, position in left.items():
+            choices.append([{joint: value} for value in self._sample_positions(joint, position)])
+        return choices
 
     def _sample_positions(self, joint: str, rest: float) -> list[float]:
         moving = self._full.joints[self._full.getJointId(joint)]
+        # A joint that turns without end has no limits.
         if moving.nq == 2:
             return [rest]
         low = self._full.lowerPositionLimit[moving.idx_q]
@@ -348,9 +356,8 @@ class _HandAnalysis:
         base = np.mean([self._find_base(finger) for finger in fingers], axis=0)
         wrist, axis = self._find_wrist()
         place = wrist.translation
-        towards = _normalize(
-            tips.mean(axis=0) - (base if np.linalg.norm(base - place) < 0.01 else place)
-        )
+        start = base if np.linalg.norm(base - place) < _AT_JOINT else place
+        towards = _normalize(tips.mean(axis=0) - start)
         joint = self._arm.palm.joint
         is_hinge = joint is not None and joint.get("type") != "prismatic"
         if is_hinge and abs(towards @ axis) <= _ALIGNED:
@@ -374,13 +381,12 @@ class _HandAnalysis:
         approach: Floats,
     ) -> tuple[Floats, Floats]:
         """Return the points of the fingertips on both sides, in the palm's frame."""
-        a = np.vstack([self._find_points(finger, positions) for finger in first])
-        b = (
-            np.vstack([self._find_points(finger, positions) for finger in second])
-            if second
-            else self._find_points(self._arm.palm, positions, alone=True)
-        )
-        return tuple(side[side @ approach >= (side @ approach).max() - _TIP] for side in (a, b))
+        own = np.vstack([self._find_points(finger, positions) for finger in first])
+        if second:
+            others = np.vstack([self._find_points(finger, positions) for finger in second])
+        else:
+            others = self._find_points(self._arm.palm, positions, alone=True)
+        return _cut_tip(own, approach), _cut_tip(others, approach)
 
     def _place_tool(
         self,
@@ -398,23 +404,28 @@ class _HandAnalysis:
         states = [dict(opened)]
         if not linked & closed.keys():
             for share in _SHARES:
-                part = {
-                    name: share * opened[name] + (1.0 - share) * closed[name] for name in closed
-                }
-                states.append({**opened, **part})
-        best, room, chosen = pin.SE3.Identity(), -1.0, states[0]
+                state = dict(opened)
+                for name in closed:
+                    state[name] = share * opened[name] + (1.0 - share) * closed[name]
+                states.append(state)
+        all_closed = {**opened, **closed}
+        best_tool = pin.SE3.Identity()
+        best_state = states[0]
+        most_room = -1.0
         for shifts in ([(0.0, 0.0)], list(itertools.product(_AHEAD, _ASIDE))):
             for state in states:
-                tool = self._find_tool(first, second, state, {**opened, **closed})
+                tool = self._find_tool(first, second, state, all_closed)
                 shapes = self._place_shapes(state)
                 for ahead, aside in shifts:
-                    moved = tool * pin.SE3(np.eye(3), np.array([aside, 0.0, ahead]))
-                    wider = _measure_room(shapes, moved)
-                    if wider > room + _LITTLE_ROOM:
-                        best, room, chosen = moved, wider, state
-                    if room >= _ROD:
-                        return best, chosen
-        return best, chosen
+                    shifted = tool * pin.SE3(np.eye(3), np.array([aside, 0.0, ahead]))
+                    room = _measure_room(shapes, shifted)
+                    if room > most_room + _LITTLE_ROOM:
+                        best_tool = shifted
+                        best_state = state
+                        most_room = room
+                    if most_room >= _ROD:
+                        return best_tool, best_state
+        return best_tool, best_state
 
     def _find_tool(
         self,
@@ -425,23 +436,25 @@ class _HandAnalysis:
     ) -> pin.SE3:
         """Return the tool frame between the fingertips of an open hand, in the palm's frame.
 
-        Fingers that swing draw back as they close, and still enclose the frame.
+        Its axes are the closing direction x, y = z × x, and the approach z. The origin is midway
+        between the tips along x and y, and behind them along z. Fingers that swing draw back as
+        they close, and still enclose the frame.
         """
         approach = self._approach
-        a, b = self._find_tips(first, second, opened, approach)
-        closing = b.mean(axis=0) - a.mean(axis=0)
+        tip, other_tip = self._find_tips(first, second, opened, approach)
+        closing = other_tip.mean(axis=0) - tip.mean(axis=0)
         closing = _snap(_normalize(closing - (closing @ approach) * approach))
-        inner = 0.5 * ((a @ closing).max() + (b @ closing).min())
+        side = np.cross(approach, closing)
+        x = 0.5 * ((tip @ closing).max() + (other_tip @ closing).min())
+        y = 0.5 * (float((tip @ side).mean()) + float((other_tip @ side).mean()))
         fingers = [*first, *(finger for finger in second if finger not in first)]
         along = np.vstack([self._find_points(finger, opened) for finger in fingers]) @ approach
-        depth = min(float((a @ approach).max()), float((b @ approach).max()))
-        depth -= min(_PAD, _SHARE * float(along.max() - along.min()))
+        z = min(float((tip @ approach).max()), float((other_tip @ approach).max()))
+        z -= min(_PAD, _SHARE * float(along.max() - along.min()))
         closed_tips = self._find_tips(first, second, closed, approach)
-        closed_depth = min(float((tips @ approach).max()) for tips in closed_tips)
-        depth = min(depth, closed_depth - _ENCLOSED)
-        side = np.cross(approach, closing)
-        across = 0.5 * (float((a @ side).mean()) + float((b @ side).mean()))
-        place = inner * closing + across * side + depth * approach
+        closed_z = min(float((points @ approach).max()) for points in closed_tips)
+        z = min(z, closed_z - _ENCLOSED)
+        place = x * closing + y * side + z * approach
         return pin.SE3(np.column_stack([closing, side, approach]), place)
 
     def _place_shapes(self, positions: Positions) -> list[PlacedShape]:
@@ -449,46 +462,86 @@ class _HandAnalysis:
 
         Invisible ones among visible ones, such as safety boxes, are left out.
         """
-        palm, links = self._place(positions), set(self._points)
+        palm = self._place(positions)
+        links = set(self._points)
         visible = {shape.link for shape in self._file.read_shapes("visual")}
         links = links & visible or links
-        return [
-            (shape.make_solid(), palm.actInv(self._data.oMf[frame]) * shape.placement)
-            for shape in self._file.read_shapes("collision")
-            if shape.link in links
-            for frame in (self._full.getFrameId(shape.link, pin.FrameType.BODY),)
-        ]
+        shapes = list[PlacedShape]()
+        for shape in self._file.read_shapes("collision"):
+            if shape.link in links:
+                link = palm.actInv(self._data.oMf[self._get_frame(shape.link)])
+                shapes.append((shape.make_solid(), link * shape.placement))
+        return shapes
 
-    def _use_flange(self, touch: tuple[str, ...]) -> Hand:
+    def _use_flange(self) -> Hand:
         """Return the tool frame at the end of an arm without fingers."""
         joint = self._full.getJointId(self._arm.joints[-1])
         palm = self._place({})
-        wrist, turn = self._find_wrist()
+        wrist, axis = self._find_wrist()
+        place = wrist.translation
         points = self._find_points(self._arm.palm, {}, alone=True)
-        frames = [self._full.getFrameId(link, pin.FrameType.BODY) for link in self._arm.palm.links]
-        ends = np.array([palm.actInv(self._data.oMf[frame]).translation for frame in frames])
-        end = ends[np.linalg.norm(ends - wrist.translation, axis=1).argmax()]
-        reach = (points.mean(axis=0) if len(points) else end) - wrist.translation
-        towards = (
-            end - wrist.translation if np.linalg.norm(end - wrist.translation) > 0.01 else reach
-        )
+        ends = list[Floats]()
+        for link in self._arm.palm.links:
+            frame = palm.actInv(self._data.oMf[self._get_frame(link)])
+            ends.append(np.array(frame.translation))
+        end = ends[int(np.linalg.norm(np.array(ends) - place, axis=1).argmax())]
+        end_distance = np.linalg.norm(end - place)
+        towards = end - place
+        if not end_distance > _AT_JOINT:
+            towards = (points.mean(axis=0) if len(points) else end) - place
         before = palm.actInv(self._data.oMi[self._full.parents[joint]]).translation
-        if (
-            np.linalg.norm(end - wrist.translation) < 0.01
-            and abs((wrist.translation - before) @ turn) > 0.01
-        ):
+        if end_distance < _AT_JOINT and abs((place - before) @ axis) > _AT_JOINT:
             # The last link's frame is at its joint, and its shape may lie behind it.
-            towards = wrist.translation - before
-        is_aligned = abs(turn @ _normalize(towards)) > _ALIGNED
-        approach = _snap(turn * np.sign(turn @ towards) if is_aligned else _normalize(towards))
-        depth = max(
-            float((points @ approach).max()) if len(points) else -np.inf, float(end @ approach)
-        )
-        place = wrist.translation + (depth - wrist.translation @ approach) * approach
+            towards = place - before
+        is_aligned = abs(axis @ _normalize(towards)) > _ALIGNED
+        approach = axis * np.sign(axis @ towards) if is_aligned else _normalize(towards)
+        approach = _snap(approach)
+        depth = float(end @ approach)
+        if len(points):
+            depth = max(float((points @ approach).max()), depth)
+        origin = place + (depth - place @ approach) * approach
         closing = _normalize(np.cross(np.eye(3)[np.abs(approach).argmin()], approach))
-        tool = pin.SE3(np.column_stack([closing, np.cross(approach, closing), approach]), place)
-        sure, why = "likely" if is_aligned else "guess", "at the end of the arm: it has no fingers"
-        return Hand(self._link, tool, {}, {}, 0.0, touch, sure, why)
+        axes = np.column_stack([closing, np.cross(approach, closing), approach])
+        return Hand(
+            link=self._link,
+            tool=pin.SE3(axes, origin),
+            open={},
+            closed={},
+            opening=0.0,
+            touch_links=self._touch_links,
+            sure="likely" if is_aligned else "guess",
+            why="at the end of the arm: it has no fingers",
+        )
+
+
+def _describe_fingers(count: int, *, is_linkage: bool) -> str:
+    if is_linkage:
+        return "the fingers of a linkage"
+    names = {1: "one jaw and the hand", 2: "two fingers"}
+    return names.get(count, f"{count} fingers")
+
+
+def _measure_travel(opened: Positions, choice: Positions) -> float:
+    """Return the largest distance of a joint from its open position, [m] or [rad]."""
+    return max(abs(value - opened[name]) for name, value in choice.items())
+
+
+def _is_thumb(finger: Body) -> bool:
+    for body in finger.subtree():
+        if any("thumb" in split_words(link) for link in body.links):
+            return True
+    return False
+
+
+def _measure_spread(points: Floats) -> float:
+    """Return the sum of squared distances of points, shape (n, 3), from their mean [m²]."""
+    return float(((points - points.mean(axis=0)) ** 2).sum())
+
+
+def _cut_tip(points: Floats, approach: Floats) -> Floats:
+    """Return the foremost of some points, shape (n, 3)."""
+    along = points @ approach
+    return points[along >= along.max() - _TIP]
 
 
 def _measure_room(shapes: Sequence[PlacedShape], tool: pin.SE3) -> float:

@@ -7,14 +7,13 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.importing.description import Coupling, Description, Joint, Loop
+from vkc_pin.importing.description import MOVING_KINDS, Coupling, Description, Joint, Loop
 from vkc_pin.utils.arrays import Floats
 
 _STEPS = 8  # steps of the driving joint from rest to either end of its range
 _GAP = 1e-3  # [m] largest distance at which a loop counts as closed
 _STIFFNESS = 1e-4  # weight of the distance from the previous configuration
 _MAX_JOINTS = 24
-_MOVING = ("revolute", "continuous", "prismatic")
 
 
 def solve_linkages(description: Description) -> list[list[dict[str, float]]]:
@@ -30,7 +29,7 @@ def solve_linkages(description: Description) -> list[list[dict[str, float]]]:
     found = list[list[dict[str, float]]]()
     for names, loops, couplings in _find_linkages(description):
         joints = [joint for joint in description.joints.values() if joint.name in names]
-        are_scalar = all(joint.kind in _MOVING for joint in joints)
+        are_scalar = all(joint.kind in MOVING_KINDS for joint in joints)
         if are_scalar and len(joints) <= _MAX_JOINTS:
             found.append(_Linkage(description, joints, loops, couplings).sweep())
     return found

@@ -64,10 +64,11 @@ class Clearances:
         Args:
             moved: Whether to return links that the arm moves, or the others.
         """
-        heights: dict[str, float] = {}
+        heights = dict[str, float]()
         lowest = self._distances.compute_lowest_points()
         for k in np.flatnonzero(self._is_moved == moved).tolist():
-            heights[self._names[k]] = min(float(lowest[k]), heights.get(self._names[k], np.inf))
+            link = self._names[k]
+            heights[link] = min(float(lowest[k]), heights.get(link, np.inf))
         return sorted(heights.items(), key=lambda item: item[1])
 
     def is_free(self, *, floor: float = 0.0) -> bool:
@@ -75,39 +76,39 @@ class Clearances:
         lowest = self._distances.compute_lowest_points()[self._is_moved].min(initial=np.inf)
         if lowest < floor + self._options.dist_safe:
             return False
-        close = np.flatnonzero(self._distances.compute_lower_bounds(self._pairs) < self._margins)
-        return all(
-            self._distances.compute_distance([self.pairs[k]]) >= self._margins[k]
-            for k in close.tolist()
-        )
+        lower_bounds = self._distances.compute_lower_bounds(self._pairs)
+        for k in np.flatnonzero(lower_bounds < self._margins).tolist():
+            if self._distances.compute_distance([self.pairs[k]]) < self._margins[k]:
+                return False
+        return True
 
     def least(self, limit: float = np.inf) -> float:
         """Return the smallest distance between links and to the floor [m], at most `limit`."""
-        nearest = float(
-            min(limit, self._distances.compute_lowest_points()[self._is_moved].min(initial=np.inf))
-        )
-        bounds = self._distances.compute_lower_bounds(self._pairs)
-        for k in np.argsort(bounds).tolist():
-            if bounds[k] > nearest:
+        lowest = self._distances.compute_lowest_points()[self._is_moved].min(initial=np.inf)
+        nearest = float(min(limit, lowest))
+        lower_bounds = self._distances.compute_lower_bounds(self._pairs)
+        for k in np.argsort(lower_bounds).tolist():
+            if lower_bounds[k] > nearest:
                 break
             nearest = min(nearest, self._distances.compute_distance([self.pairs[k]], nearest))
         return nearest
 
     def links(self, below: float) -> list[tuple[str, str, float]]:
         """Return pairs of links closer than `below` [m] with their distance, the closest first."""
-        distances: dict[tuple[str, str], float] = {}
-        for k in np.flatnonzero(self._distances.compute_lower_bounds(self._pairs) < below).tolist():
+        distances = dict[tuple[str, str], float]()
+        lower_bounds = self._distances.compute_lower_bounds(self._pairs)
+        for k in np.flatnonzero(lower_bounds < below).tolist():
             distance = self._distances.compute_distance([self.pairs[k]])
             if distance < below:
-                names = (self._names[self.pairs[k][0]], self._names[self.pairs[k][1]])
-                distances[names] = min(distance, distances.get(names, np.inf))
-        return sorted(
-            ((*names, distance) for names, distance in distances.items()), key=lambda item: item[2]
-        )
+                one, other = self.pairs[k]
+                links = (self._names[one], self._names[other])
+                distances[links] = min(distance, distances.get(links, np.inf))
+        found = [(one, other, distance) for (one, other), distance in distances.items()]
+        return sorted(found, key=lambda item: item[2])
 
     def by_links(self) -> LinkDistances:
         """Return the distances of its pairs of links at the current positions."""
-        groups: dict[tuple[str, str], list[tuple[int, int]]] = {}
+        groups = dict[tuple[str, str], list[tuple[int, int]]]()
         for one, other in self.pairs:
             groups.setdefault((self._names[one], self._names[other]), []).append((one, other))
         return LinkDistances(self._distances, groups)
@@ -118,12 +119,10 @@ def find_arm_positions(robot: Robot, state: Mapping[str, float]) -> Floats:
 
     Angles are shifted by 2π, or else clamped.
     """
-    return np.array(
-        [
-            find_nearest_position(robot.model, joint, state[joint])
-            for joint in robot.coordinates.names[3:]
-        ]
-    )
+    positions = list[float]()
+    for joint in robot.coordinates.names[3:]:
+        positions.append(find_nearest_position(robot.model, joint, state[joint]))
+    return np.array(positions)
 
 
 def find_home(robot: Robot, named: Iterable[tuple[str, Floats]], *, seed: int = 0) -> Home:
@@ -142,35 +141,57 @@ def find_home(robot: Robot, named: Iterable[tuple[str, Floats]], *, seed: int = 
             return Home(positions, clearance, how)
         if best is None or clearance > best.clearance:
             best = Home(positions, clearance, how)
-    rng, (low, high) = np.random.default_rng(seed), get_arm_bounds(robot)
-    middle, span = 0.5 * (low + high), np.maximum(high - low, 1e-9)
-    frame, data = robot.model.getFrameId(robot.tool_frame), robot.model.createData()
+    arm, clearance = _search_home(clearances, seed)
+    if best is not None and best.clearance >= clearance:
+        return best
+    clearances.place(arm)
+    return Home(arm, clearances.least(), "found by search")
+
+
+def _search_home(clearances: Clearances, seed: int) -> tuple[Floats, float]:
+    """Return the arm's positions of least cost among random ones, and their clearance [m].
+
+    The cost of positions z with clearance c, at most c₀, and a hand at the horizontal distance r
+    [m] from the base is
+
+        100 (c₀ - c) + mean(((z - middle) / span)²) + 0.3 r
+    """
+    robot = clearances.robot
+    low, high = get_arm_bounds(robot)
+    middle = 0.5 * (low + high)
+    span = np.maximum(high - low, 1e-9)
+    frame = robot.model.getFrameId(robot.tool_frame)
+    data = robot.model.createData()
 
     def compute_cost(arm: Floats) -> tuple[float, float]:
         """Return the cost of a configuration, and its clearance [m]."""
         clearances.place(arm)
         clearance = clearances.least(HOME_ROOM)
-        pin.framesForwardKinematics(
-            robot.model, data, robot.coordinates.q(np.concatenate([np.zeros(3), arm]))
-        )
-        out = float(np.hypot(*data.oMf[frame].translation[:2]))
+        q = robot.coordinates.q(np.concatenate([np.zeros(3), arm]))
+        pin.framesForwardKinematics(robot.model, data, q)
+        distance = float(np.hypot(*data.oMf[frame].translation[:2]))
         offset = float((((arm - middle) / span) ** 2).mean())
-        return 100.0 * max(0.0, HOME_ROOM - clearance) + offset + 0.3 * out, clearance
+        cost = 100.0 * max(0.0, HOME_ROOM - clearance) + offset + 0.3 * distance
+        return cost, clearance
 
-    trials = [middle, *rng.uniform(low, high, (_SAMPLES, len(low)))]
-    value, clearance, chosen = min(
-        ((*compute_cost(arm), k) for k, arm in enumerate(trials)), key=lambda item: item[0]
-    )
-    arm = trials[chosen]
+    rng = np.random.default_rng(seed)
+    best = middle
+    least_cost, clearance_at_best = compute_cost(middle)
+    for trial in rng.uniform(low, high, (_SAMPLES, len(low))):
+        cost, clearance = compute_cost(trial)
+        if cost < least_cost:
+            best = trial
+            least_cost = cost
+            clearance_at_best = clearance
+    # A local search around the best sample, in ever smaller steps
     for width in np.geomspace(0.2, 0.01, _STEPS):
-        trial = np.clip(arm + width * span * rng.standard_normal(len(arm)), low, high)
-        new, gap = compute_cost(trial)
-        if new < value:
-            arm, value, clearance = trial, new, gap
-    if best is not None and best.clearance >= clearance:
-        return best
-    clearances.place(arm)
-    return Home(arm, clearances.least(), "found by search")
+        trial = np.clip(best + width * span * rng.standard_normal(len(best)), low, high)
+        cost, clearance = compute_cost(trial)
+        if cost < least_cost:
+            best = trial
+            least_cost = cost
+            clearance_at_best = clearance
+    return best, clearance_at_best
 
 
 def find_inseparable_pairs(
@@ -189,19 +210,23 @@ def find_inseparable_pairs(
     Returns:
         The pairs with their largest distance [m].
     """
-    clearances, rng = Clearances(robot), np.random.default_rng(seed)
+    clearances = Clearances(robot)
+    rng = np.random.default_rng(seed)
     low, high = get_arm_bounds(robot)
     pairs = clearances.by_links()
-    furthest, separated = dict.fromkeys(pairs.links, -np.inf), dict.fromkeys(pairs.links, 0)
+    furthest = dict.fromkeys(pairs.links, -np.inf)
+    separated_counts = dict.fromkeys(pairs.links, 0)
+    largest_count = (1.0 - share) * samples
     for arm in (robot.home, *rng.uniform(low, high, (samples, len(low)))):
         clearances.place(arm)
-        for k, (links, bound) in enumerate(
-            zip(pairs.links, pairs.compute_lower_bounds(), strict=True)
-        ):
-            distance = float(bound) if bound > margin else pairs.compute_distance(k, margin)
+        lower_bounds = pairs.compute_lower_bounds()
+        for k, links in enumerate(pairs.links):
+            bound = float(lower_bounds[k])
+            distance = bound if bound > margin else pairs.compute_distance(k, margin)
             furthest[links] = max(furthest[links], distance)
-            separated[links] += distance >= margin
-        pairs.select([separated[links] <= (1.0 - share) * samples for links in pairs.links])
+            separated_counts[links] += distance >= margin
+        # A pair that is separated more often is dropped.
+        pairs.select([separated_counts[links] <= largest_count for links in pairs.links])
         if not pairs.links:
             break
     return {links: furthest[links] for links in pairs.links}
@@ -212,29 +237,27 @@ def find_nested_pairs(robot: Robot, margin: float) -> list[tuple[str, str]]:
 
     These are the links that one coordinate slides, and those from which they slide.
     """
-    clearances, bounds = Clearances(robot), (robot.lower, robot.upper)
-    joints = dict[int, set[int]]()
+    clearances = Clearances(robot)
+    joints = dict[int, set[int]]()  # that slide, by the coordinate
     for move in robot.coordinates.moves:
         if move.slides:
             joints.setdefault(move.coordinate, set()).add(move.joint)
     nested = set[tuple[str, str]]()
     for coordinate, moved in joints.items():
-        if len(moved) > 1:
-            parts = moved | {int(robot.model.parents[joint]) for joint in moved}
-            links = {
-                robot.link_of(k)
-                for k, shape in enumerate(robot.collision.geometryObjects)
-                if shape.parentJoint in parts
-            }
-            for bound in bounds:
-                arm = robot.home.copy()
-                arm[coordinate - 3] = bound[coordinate]
-                clearances.place(arm)
-                nested |= {
-                    (min(pair), max(pair))
-                    for *pair, _ in clearances.links(margin)
-                    if links.issuperset(pair)
-                }
+        if len(moved) < 2:
+            continue
+        carriers = moved | {int(robot.model.parents[joint]) for joint in moved}
+        links = set[str]()
+        for k, shape in enumerate(robot.collision.geometryObjects):
+            if shape.parentJoint in carriers:
+                links.add(robot.link_of(k))
+        for bound in (robot.lower, robot.upper):
+            arm = robot.home.copy()
+            arm[coordinate - 3] = bound[coordinate]
+            clearances.place(arm)
+            for one, other, _ in clearances.links(margin):
+                if one in links and other in links:
+                    nested.add((min(one, other), max(one, other)))
     return sorted(nested)
 
 
@@ -248,25 +271,32 @@ def find_sunken_links(robot: Robot) -> list[str]:
 
     They are drawn as columns, which a real base takes in or which telescope.
     """
-    model, data = robot.model, robot.model.createData()
-    lowest = np.maximum(get_arm_bounds(robot)[0], -_DEEP)
+    model = robot.model
+    data = model.createData()
+    low, _ = get_arm_bounds(robot)
+    lowest = np.maximum(low, -_DEEP)
     pin.forwardKinematics(model, data, robot.coordinates.q(np.concatenate([np.zeros(3), lowest])))
+    # Joint 1 is the planar base.
     lifts = {1}
     for joint in range(2, model.njoints):
+        # The joint's motion in its own frame is (v, ω), with v = 0 for revolute joints.
         motion = np.asarray(data.joints[joint].S, float).reshape(6, -1)[:, 0]
         is_vertical = abs((data.oMi[joint].rotation @ motion[:3])[2]) > _VERTICAL
         if is_vertical and model.parents[joint] in lifts:
             lifts.add(joint)
-    tops, floor = dict[str, float](), 0.0
+    tops = dict[str, float]()
+    floor = 0.0
     for k, shape in enumerate(robot.collision.geometryObjects):
-        if shape.parentJoint in lifts:
-            place = data.oMi[shape.parentJoint] * shape.placement
-            heights = triangulate(shape.geometry)[0] @ place.rotation[2] + place.translation[2]
-            if shape.parentJoint == 1:
-                floor = min(floor, float(heights.min()))
-            else:
-                name = robot.link_of(k)
-                tops[name] = max(float(heights.max()), tops.get(name, -np.inf))
+        if shape.parentJoint not in lifts:
+            continue
+        place = data.oMi[shape.parentJoint] * shape.placement
+        vertices, _ = triangulate(shape.geometry)
+        heights = vertices @ place.rotation[2] + place.translation[2]
+        if shape.parentJoint == 1:
+            floor = min(floor, float(heights.min()))
+        else:
+            link = robot.link_of(k)
+            tops[link] = max(float(heights.max()), tops.get(link, -np.inf))
     return sorted(link for link, top in tops.items() if top < floor + _SUNKEN)
 
 
@@ -278,13 +308,14 @@ def measure_floor_heights(
     The latter is the smallest of the arm links' largest heights: a shoulder at the floor never
     leaves it.
     """
-    clearances, rng = Clearances(robot), np.random.default_rng(seed)
+    clearances = Clearances(robot)
     clearances.place(robot.home)
-    base_heights = [height for link, height in clearances.floor(moved=False)]
+    base_heights = [height for _, height in clearances.floor(moved=False)]
+    rng = np.random.default_rng(seed)
     low, high = get_arm_bounds(robot)
-    best: dict[str, float] = {}
+    largest = dict[str, float]()
     for arm in rng.uniform(low, high, (samples, len(low))):
         clearances.place(arm)
         for link, height in clearances.floor():
-            best[link] = max(height, best.get(link, -np.inf))
-    return min(base_heights, default=0.0), min(best.values(), default=np.inf)
+            largest[link] = max(height, largest.get(link, -np.inf))
+    return min(base_heights, default=0.0), min(largest.values(), default=np.inf)

@@ -54,7 +54,8 @@ from vkc_pin.importing.targets import (
 )
 from vkc_pin.importing.urdf_writing import add_connection
 from vkc_pin.options import Options
-from vkc_pin.utils.arguments import check_bool, check_integer, check_mapping, check_text
+from vkc_pin.utils.arguments import check_bool, check_integer, check_text
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.words import split_words
 from vkc_pin.world.files.resources import check_path, choose_file_names
 from vkc_pin.world.files.srdf import format_srdf
@@ -69,9 +70,9 @@ from vkc_pin.world.models.wheels import Drive, describe_misplaced_axle, find_dri
 PICTURE = "robot.png"
 """File name of a robot's picture."""
 _SAMPLES = 2000
-# Samples, and the smallest fraction of them in which a pair of neighbours is close
-_NEAR, _MOSTLY = 300, 0.75
-# [m] Distance up to which links are neighbours by design, such as the segments of a telescope
+_NEIGHBOUR_SAMPLES = 300  # random configurations in which neighbours are searched for
+_MOSTLY = 0.75  # smallest fraction of them in which neighbours are close
+# [m] distance up to which links are neighbours by design, such as the segments of a telescope
 _NEIGHBOURS = Options().dist_safe + 0.005
 _CLOSED = 0.01  # [m] opening below which fingers that do not move can grasp nothing
 _FINGERS = "in robot.yaml: `gripper: {FINGER_JOINT: {closed: POSITION, open: POSITION}}`"
@@ -156,42 +157,35 @@ def import_robot(  # noqa: PLR0913 - keyword options of a public call
     if most_pieces is not None:
         check_integer(most_pieces, "most_pieces", low=1, high=1000)
     check_integer(samples, "samples", low=1, high=1_000_000)
-    places = {
-        key: check_path(place, f"packages.{key}")
-        for key, place in check_mapping(packages or {}, "packages").items()
-    }
-    given_arguments = {
-        key: str(value) for key, value in check_mapping(arguments or {}, "arguments").items()
-    }
     srdf_path = None if srdf is None else check_path(srdf, "srdf")
     check_source(path, "a URDF, xacro, MJCF or SDF file")
     check_target(target, "import-robot", force=check_bool(force, "force"))
     # `check_target` allowed replacing it
     with write_folder_atomically(target, force=True, source=path) as staging:
         source = read_source(
-            path, staging / ".meshes", packages=places, arguments=given_arguments, srdf=srdf_path
+            path, staging / ".meshes", packages=packages, arguments=arguments, srdf=srdf_path
         )
+        importer = _Importer(source, staging, Path(os.path.realpath(target)).name)
         with warnings.catch_warnings():
             # They name temporary files, and loading the folder repeats them.
             warnings.simplefilter("ignore")
-            imported = _Importer(source, staging, Path(os.path.realpath(target)).name).run(
-                arm, tool_frame, most_pieces, samples, seed
-            )
+            imported = importer.run(arm, tool_frame, most_pieces, samples, seed)
     return dataclasses.replace(imported, folder=target, robot=load_robot(target / "robot.yaml"))
 
 
 class _Importer:
     def __init__(self, source: Source, folder: Path, name: str) -> None:
-        self._source, self._file, self._folder, self._name = source, source.file, folder, name
+        self._source = source
+        self._file = source.file
+        self._folder = folder
+        self._name = name
         (stem,) = choose_file_names([name], fallback="robot")
         self._settings: dict[str, Any] = {"urdf": f"{stem}.urdf", "srdf": f"{stem}.srdf"}
         self._base = "omni"
         self._drive: Drive | None = None
         self._group: str | None = None
-        self._findings = [
-            *(Finding("warning", "shapes", text) for text in source.warnings),
-            *(Finding("note", "file", text) for text in source.notes),
-        ]
+        self._findings = [Finding("warning", "shapes", text) for text in source.warnings]
+        self._findings += [Finding("note", "file", text) for text in source.notes]
 
     def run(
         self,
@@ -202,9 +196,10 @@ class _Importer:
         seed: int,
     ) -> ImportedRobot:
         """Write all files into the folder."""
-        if tool_frame is not None and tool_frame not in (names := sorted(self._get_names())):
+        names = self._get_names()
+        if tool_frame is not None and tool_frame not in names:
             raise UnknownNameError(
-                "frame", tool_frame, names, file=self._file.path, field="tool_frame"
+                "frame", tool_frame, sorted(names), file=self._file.path, field="tool_frame"
             )
         tree = build_body_tree(self._file)
         self._use_visual_shapes(tree)
@@ -228,9 +223,13 @@ class _Importer:
             self._set_hand(hand, tool_frame)
         if tool_frame is not None:
             self._settings["tool_frame"] = tool_frame
-        robot = self._remove_columns(self._remove_envelopes(self._write_and_load()))
+        robot = self._write_and_load()
+        robot = self._remove_envelopes(robot)
+        robot = self._remove_columns(robot)
         robot = self._place_root(robot, seed)
-        self._report(pieces, self._find_home(robot, samples, seed))
+        home = self._find_home(robot, samples, seed)
+        self._report_home(home)
+        self._report_pieces(pieces)
         robot = load_robot(self._folder / "robot.yaml")
         if hand is not None and tool_frame is None:
             robot = self._turn_tool(robot, hand, seed)
@@ -257,12 +256,15 @@ class _Importer:
             is_on_arm = joints_above >= _AT_END or joints_above + body.depth() > _AT_END
             if not solid or (is_on_arm and not solid & set(body.links)):
                 links |= set(body.links)
-        used = list[str]()
+        used = dict[str, None]()  # an ordered set
         for link in self._file.root.findall("link"):
-            for visual in link.findall("visual") if link.get("name") in links else ():
+            name = link.get("name", "")
+            if name not in links:
+                continue
+            for visual in link.findall("visual"):
                 element = ElementTree.SubElement(link, "collision")
                 element.extend(child for child in visual if child.tag in ("origin", "geometry"))
-                used.append(link.get("name", ""))
+                used[name] = None
         if not solid and not used:
             raise InputError(
                 "the robot has no shapes",
@@ -270,73 +272,72 @@ class _Importer:
                 expected="<collision> or <visual> elements",
             )
         if used:
-            which = ", ".join(dict.fromkeys(used)) if solid else "all links"
+            which = ", ".join(used) if solid else "all links"
             self._guess("guess", f"visual shapes are used for want of collision shapes: {which}")
 
     def _guess(self, sure: str, text: str, hint: str = "") -> None:
-        self._findings.append(
-            Finding("warning" if sure == "guess" else "note", "guessed", f"{text} [{sure}]", hint)
-        )
+        """Report an assumption with its confidence, "sure", "likely" or "guess"."""
+        level = "warning" if sure == "guess" else "note"
+        self._findings.append(Finding(level, "guessed", f"{text} [{sure}]", hint))
+
+    def _update_setting(self, key: str, values: Mapping[str, Any]) -> None:
+        """Add values to a mapping in robot.yaml."""
+        self._settings.setdefault(key, {}).update(values)
 
     def _set_arm(self, chosen: Arm | None, arms: list[Arm], base_joints: tuple[str, ...]) -> None:
         if base_joints:
-            self._settings.setdefault("locked_joints", {}).update(dict.fromkeys(base_joints, 0.0))
-            self._guess(
-                "sure",
-                "the planner's base replaces that of the file: "
-                f"{', '.join(base_joints)} are locked",
-            )
+            self._update_setting("locked_joints", dict.fromkeys(base_joints, 0.0))
+            text = "the planner's base replaces that of the file"
+            self._guess("sure", f"{text}: {', '.join(base_joints)} are locked")
         carrying = base_joints if chosen is None else (*base_joints, *chosen.joints)
-        self._drive = find_drive(build_full_model(self._file), self._file, carrying)
+        full = build_full_model(self._file)
+        self._drive = find_drive(full, self._file, carrying)
         self._set_base(self._drive)
-        if chosen is not None:
-            for leader, *others in find_telescopes(build_full_model(self._file), chosen.joints):
-                self._settings.setdefault("couplings", {}).update(dict.fromkeys(others, leader))
-                text = f"{', '.join(others)} follow {leader} as a telescope: one coordinate"
-                self._guess(
-                    "likely",
-                    text,
-                    "if each has a motor of its own: remove `couplings` from robot.yaml",
-                )
-            others = [other.name for other in arms if other is not chosen]
-            also = f"; others: {', '.join(others)}" if others else ""
-            self._guess(
-                chosen.sure,
-                f"arm: {chosen.name}, {chosen.why}{also}",
-                "to choose another: arm, --arm" if others else "",
-            )
+        if chosen is None:
+            return
+        for leader, *followers in find_telescopes(full, chosen.joints):
+            self._update_setting("couplings", dict.fromkeys(followers, leader))
+            text = f"{', '.join(followers)} follow {leader} as a telescope: one coordinate"
+            hint = "if each has a motor of its own: remove `couplings` from robot.yaml"
+            self._guess("likely", text, hint)
+        text = f"arm: {chosen.name}, {chosen.why}"
+        hint = ""
+        others = [other.name for other in arms if other is not chosen]
+        if others:
+            text += f"; others: {', '.join(others)}"
+            hint = "to choose another: arm, --arm"
+        self._guess(chosen.sure, text, hint)
 
     def _set_base(self, drive: Drive | None) -> None:
-        self._base, why, sure = "omni", _NO_WHEELS, "guess"
-        if drive is not None:
-            self._base, why, sure = drive.kind, drive.why, "likely"
-            if drive.turning_radius is not None:
-                radius = round(drive.turning_radius, 3)
-                self._settings["base"] = {"turning_radius": radius}
-                why += f", turning radius {radius:g} m"
-        self._guess(
-            sure,
-            f"base: {self._base} ({why})",
-            "if it is wrong: `base` in scene.yaml and other scenes",
-        )
+        hint = "if it is wrong: `base` in scene.yaml and other scenes"
+        if drive is None:
+            self._base = "omni"
+            self._guess("guess", f"base: {self._base} ({_NO_WHEELS})", hint)
+            return
+        self._base = drive.kind
+        why = drive.why
+        if drive.turning_radius is not None:
+            radius = round(drive.turning_radius, 3)
+            self._settings["base"] = {"turning_radius": radius}
+            why += f", turning radius {radius:g} m"
+        self._guess("likely", f"base: {self._base} ({why})", hint)
 
     def _set_hand(self, hand: Hand, tool_frame: str | None) -> None:
-        links = [link for link in hand.touch_links if link in set(self._file.links)]
-        self._settings["touch_links"] = links
+        known = set(self._file.links)
+        self._settings["touch_links"] = [link for link in hand.touch_links if link in known]
         for key, values in hand.settings().items():
-            self._settings.setdefault(key, {}).update(values)
+            self._update_setting(key, values)
         if hand.open and not hand.closed:
             self._report_locked_fingers(hand)
         if tool_frame is None:
             tool = choose_free_name("tool", self._get_names())
             self._add_link(tool, hand.link, hand.tool)
             self._settings["tool_frame"] = tool
-            self._guess(
-                hand.sure,
-                f"hand: frame '{tool}' {hand.why}",
+            hint = (
                 "if it is wrong: `tool_frame`, a link with z along the approach and x along the "
-                "closing direction",
+                "closing direction"
             )
+            self._guess(hand.sure, f"hand: frame '{tool}' {hand.why}", hint)
 
     def _turn_tool(self, robot: Robot, hand: Hand, seed: int) -> Robot:
         """Return the robot with its closing direction reversed if its wrist then can do more."""
@@ -352,13 +353,15 @@ class _Importer:
 
     def _report_locked_fingers(self, hand: Hand) -> None:
         """Report that the gripper does not move, a fault if its fingers are closed."""
-        limits = {
-            name: tuple(limit.get(key, "0") for key in ("lower", "upper"))
-            for joint in self._file.root.findall("joint")
-            if (name := joint.get("name", "")) in hand.open
-            and (limit := joint.find("limit")) is not None
-        }
-        fixed = [f"{name} {low} to {high}" for name, (low, high) in limits.items() if low == high]
+        fixed = list[str]()
+        for joint in self._file.root.findall("joint"):
+            name = joint.get("name", "")
+            limit = joint.find("limit")
+            if name in hand.open and limit is not None:
+                low = limit.get("lower", "0")
+                high = limit.get("upper", "0")
+                if low == high:
+                    fixed.append(f"{name} {low} to {high}")
         text = f"the gripper does not move: its fingers stay {1e3 * hand.opening:.0f} mm apart"
         hint = _FINGERS
         if fixed:
@@ -378,22 +381,17 @@ class _Importer:
             if not str(error.field).startswith("gripper"):
                 raise
             fingers = self._settings.pop("gripper")
-            self._settings.setdefault("locked_joints", {}).update(
-                {joint: ends["open"] for joint, ends in fingers.items()}
-            )
-            self._guess(
-                "guess",
-                f"the fingers are locked: {error.problem}, {error.got}",
-                _FINGERS,
-            )
+            opened = {joint: ends["open"] for joint, ends in fingers.items()}
+            self._update_setting("locked_joints", opened)
+            text = f"the fingers are locked: {error.problem}, {error.got}"
+            self._guess("guess", text, _FINGERS)
             return self._write_and_load()
 
     def _get_names(self) -> set[str]:
-        return {
-            element.get("name", "")
-            for tag in ("link", "joint")
-            for element in self._file.root.findall(tag)
-        }
+        """Return the names of all links and joints."""
+        root = self._file.root
+        elements = [*root.findall("link"), *root.findall("joint")]
+        return {element.get("name", "") for element in elements}
 
     def _add_link(self, name: str, parent: str, placement: pin.SE3) -> None:
         root = self._file.root
@@ -401,13 +399,13 @@ class _Importer:
         add_connection(root, f"{name}_joint", "fixed", parent, name, placement)
 
     def _write(self) -> None:
-        settings = {
-            key: value
-            for key, value in self._settings.items()
-            if key != "srdf" or (self._folder / value).is_file()
-        }
+        settings = dict(self._settings)
+        # The SRDF is written last.
+        if not (self._folder / settings["srdf"]).is_file():
+            del settings["srdf"]
         ElementTree.indent(self._file.root)
-        file, marker = self._source.file.path.name, get_origin_marker("import-robot")
+        file = self._source.file.path.name
+        marker = get_origin_marker("import-robot")
         source = f"{file} ({self._source.kind}) {marker}"
         head = format_comment(f"Made of {source}. Units: m, rad, s.")
         body = yaml.safe_dump(settings, sort_keys=False, default_flow_style=None, width=120)
@@ -417,12 +415,12 @@ class _Importer:
 
     def _remove_envelopes(self, robot: Robot) -> Robot:
         """Return the robot without shapes that merely enclose its hand."""
-        if not (envelopes := find_envelopes(robot)):
+        envelopes = find_envelopes(robot)
+        if not envelopes:
             return robot
         remove_collision_shapes(self._file.root, envelopes)
-        self._settings["touch_links"] = [
-            link for link in self._settings.get("touch_links", ()) if link not in envelopes
-        ]
+        touch_links = self._settings.get("touch_links", ())
+        self._settings["touch_links"] = [link for link in touch_links if link not in envelopes]
         for link, share in envelopes.items():
             text = f"{link} encloses {share:.0%} of the hand: left out"
             self._findings.append(Finding("warning", "hand", text))
@@ -430,7 +428,8 @@ class _Importer:
 
     def _remove_columns(self, robot: Robot) -> Robot:
         """Return the robot without shapes that its lift sinks into the floor."""
-        if not (columns := find_sunken_links(robot)):
+        columns = find_sunken_links(robot)
+        if not columns:
             return robot
         remove_collision_shapes(self._file.root, columns)
         for link in columns:
@@ -479,58 +478,59 @@ class _Importer:
 
     def _find_home(self, robot: Robot, samples: int, seed: int) -> Home:
         """Write the SRDF and home of a robot that is loaded with all pairs; return the home."""
-        allowed = {
-            **self._source.srdf.allowed,
-            **sample_allowed_pairs(robot, samples=samples, seed=seed),
-        }
-        sampled = set_collision_pairs(robot, allowed)
-        for one, other in find_inseparable_pairs(
-            sampled, _NEIGHBOURS, samples=_NEAR, share=_MOSTLY, seed=seed
-        ):
-            text = (
-                f"{one} and {other} are rarely {1e3 * _NEIGHBOURS:.0f} mm apart: "
-                "the pair is not checked"
-            )
-            self._findings.append(Finding("note", "pairs", text))
-            allowed[min(one, other), max(one, other)] = "Near"
-        for one, other in find_nested_pairs(set_collision_pairs(robot, allowed), _NEIGHBOURS):
-            text = f"{one} and {other} are parts of a telescope: the pair is not checked"
-            self._findings.append(Finding("note", "pairs", text))
-            allowed[one, other] = "Near"
-        checked, arm = set_collision_pairs(robot, allowed), robot.coordinates.names[3:]
-        states = self._source.srdf.find_states(arm, self._group)
-        named = [
-            (f"the state '{name}' of the file", find_arm_positions(robot, state))
-            for name, state in states.items()
-            if set(arm) <= set(state)
-        ]
-        home = find_home(checked, [*named, ("joints at 0 or mid-range", robot.home)], seed=seed)
-        self._settings["home"] = {
-            joint: round(float(value), 6) for joint, value in zip(arm, home.positions, strict=True)
-        }
+        allowed = self._find_allowed_pairs(robot, samples, seed)
+        arm = robot.coordinates.names[3:]
+        candidates = list[tuple[str, Floats]]()
+        for name, state in self._source.srdf.find_states(arm, self._group).items():
+            if set(arm) <= set(state):
+                how = f"the state '{name}' of the file"
+                candidates.append((how, find_arm_positions(robot, state)))
+        candidates.append(("joints at 0 or mid-range", robot.home))
+        home = find_home(set_collision_pairs(robot, allowed), candidates, seed=seed)
         positions = dict(zip(arm, map(float, home.positions), strict=True))
+        self._settings["home"] = {joint: round(value, 6) for joint, value in positions.items()}
         text = format_srdf(self._name, positions, dict(sorted(allowed.items())))
         (self._folder / self._settings["srdf"]).write_text(text, encoding="utf-8")
         self._write()
         return home
 
-    def _report(self, pieces: list[Piece], home: Home) -> None:
+    def _find_allowed_pairs(
+        self, robot: Robot, samples: int, seed: int
+    ) -> dict[tuple[str, str], str]:
+        """Return pairs of links that are not checked, with the reason, and note neighbours."""
+        allowed = dict(self._source.srdf.allowed)
+        allowed |= sample_allowed_pairs(robot, samples=samples, seed=seed)
+        inseparable = find_inseparable_pairs(
+            set_collision_pairs(robot, allowed),
+            _NEIGHBOURS,
+            samples=_NEIGHBOUR_SAMPLES,
+            share=_MOSTLY,
+            seed=seed,
+        )
+        for one, other in inseparable:
+            about = f"{one} and {other} are rarely {1e3 * _NEIGHBOURS:.0f} mm apart"
+            self._findings.append(Finding("note", "pairs", f"{about}: the pair is not checked"))
+            allowed[min(one, other), max(one, other)] = "Near"
+        for one, other in find_nested_pairs(set_collision_pairs(robot, allowed), _NEIGHBOURS):
+            about = f"{one} and {other} are parts of a telescope"
+            self._findings.append(Finding("note", "pairs", f"{about}: the pair is not checked"))
+            allowed[one, other] = "Near"
+        return allowed
+
+    def _report_home(self, home: Home) -> None:
         values = ", ".join(f"{value:.2f}" for value in home.positions)
         sure = "sure" if home.clearance > 0.0 else "guess"
         self._guess(sure, f"home: {home.how} ({values}), clearance {1e3 * home.clearance:.0f} mm")
-        for piece in {piece.mesh: piece for piece in pieces if piece.count > 1}.values():
-            what = (
-                f"{piece.mesh} in {piece.count} pieces, "
-                f"{100.0 * piece.overhead:.0f} % more than its volume"
-            )
+
+    def _report_pieces(self, pieces: list[Piece]) -> None:
+        """Note the meshes of several pieces, each once."""
+        by_mesh = {piece.mesh: piece for piece in pieces if piece.count > 1}
+        for piece in by_mesh.values():
+            volume = f"{100.0 * piece.overhead:.0f} % more than its volume"
             hull = f"its hull: {100.0 * piece.hull:.0f} %"
-            self._findings.append(
-                Finding(
-                    "note",
-                    "shapes",
-                    f"{piece.link}: {what} ({hull}), protruding by {1e3 * piece.error:.0f} mm",
-                )
-            )
+            protrusion = f"protruding by {1e3 * piece.error:.0f} mm"
+            about = f"{piece.mesh} in {piece.count} pieces, {volume} ({hull}), {protrusion}"
+            self._findings.append(Finding("note", "shapes", f"{piece.link}: {about}"))
 
 
 def _find_footprint(robot: Robot) -> tuple[str, float] | None:

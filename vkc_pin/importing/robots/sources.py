@@ -13,6 +13,7 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError
 from vkc_pin.importing.description import (
+    MOVING_KINDS,
     Coupling,
     Description,
     Joint,
@@ -28,7 +29,6 @@ from vkc_pin.world.files.resources import choose_file_names
 from vkc_pin.world.files.srdf import Srdf, SrdfState, find_srdf, read_srdf
 from vkc_pin.world.files.urdf import UrdfFile
 
-_MOVING = ("revolute", "continuous", "prismatic")
 _FAR = 20.0  # [m] limits of prismatic joints without limits
 _MOST_NAMES = 8  # in a note
 _UNLIMITED = (-math.inf, math.inf)
@@ -59,8 +59,8 @@ def read_source(
     file: Path,
     scratch: Path,
     *,
-    packages: Mapping[str, Path],
-    arguments: Mapping[str, str],
+    packages: Mapping[str, str | Path] | None = None,
+    arguments: Mapping[str, str] | None = None,
     srdf: Path | None = None,
 ) -> Source:
     """Read a robot from a file; see `read_description`.
@@ -84,7 +84,7 @@ def read_source(
     root = make_urdf(description, file.stem)
     check_tree(file, root)
     text = ElementTree.tostring(root, encoding="unicode")
-    read = UrdfFile(file.resolve(), text, root, dict(packages))
+    read = UrdfFile(file.resolve(), text, root)
     semantics, notes = _read_semantics(file, srdf, root)
     states = [SrdfState(name, "", state) for name, state in description.states.items()]
     return Source(
@@ -113,7 +113,7 @@ def _extract_largest_tree(description: Description) -> Description:
     counts = dict[str, int]()
     for body in description.children().get(world, ()):
         kinds = [description.joints[link].kind for link in description.subtree(body)]
-        counts[body] = sum(kind in _MOVING for kind in kinds)
+        counts[body] = sum(kind in MOVING_KINDS for kind in kinds)
     if max(counts.values(), default=0) == 0:
         raise InputError(
             "the file has no joints", file=description.file, expected="a body with joints"
@@ -184,7 +184,7 @@ def _complete_limits(description: Description) -> Description:
     notes = list[str]()
     incomplete = list[str]()
     for child, joint in description.joints.items():
-        if joint.kind not in _MOVING:
+        if joint.kind not in MOVING_KINDS:
             continue
         if joint.velocity is None or joint.effort is None:
             incomplete.append(joint.name)

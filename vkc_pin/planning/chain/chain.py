@@ -38,7 +38,8 @@ class Kinematics:
     """Kinematics of one model; all symbolic users share its expressions."""
 
     def __init__(self, model: pin.Model) -> None:
-        self._coordinates, self._function = Coordinates(model), cpin.joint_placements(model)
+        self._coordinates = Coordinates(model)
+        self._function = cpin.joint_placements(model)
 
     def build_placements(self, z: Any) -> Any:
         """Return the placements of all joints at the symbols z, shape (n, 1), as (12, J − 1).
@@ -51,16 +52,16 @@ class Kinematics:
     def batch(self) -> BatchFunction:
         """Batch function z → columns of R and t of every joint's world placement, (12·(J − 1),)."""
         z = ca.SX.sym("z", self._coordinates.size)
-        return BatchFunction(
-            ca.Function("placements", [z], [ca.densify(self.build_placements(z))], {"cse": True})
-        )
+        placements = ca.densify(self.build_placements(z))
+        return BatchFunction(ca.Function("placements", [z], [placements], {"cse": True}))
 
     @property
     def nbytes(self) -> int:
         """Estimated size in memory [bytes]."""
-        return estimate_size(self._function) + (
-            self.batch.nbytes if "batch" in self.__dict__ else 0
-        )
+        size = estimate_size(self._function)
+        if "batch" in self.__dict__:  # it has been built
+            size += self.batch.nbytes
+        return size
 
 
 def get_kinematics(model: pin.Model, cache: Cache) -> Kinematics:
@@ -105,31 +106,33 @@ def invert(
     # joint of the path → joint of the new model that carries its body, and the body's placement
     carrier: dict[int, tuple[int, pin.SE3]] = {path[0]: (0, root.placement.inverse())}
     for child, parent in pairwise(path):
+        # From the child's body to the parent's: J(q)⁻¹·P⁻¹ = turn·J_z(q)·turn⁻¹·P⁻¹, with the
+        # rotation `turn` from z to the negated axis.
         new_parent, body = carrier[child]
         joint, axis = _align_with_z(source, data, child)
         turn = pin.SE3(_rotate_z_to(-axis), np.zeros(3))
-        index = add_joint(
-            model, new_parent, joint, round_placement(body * turn), like=(source, child)
-        )
+        placement = round_placement(body * turn)
+        index = add_joint(model, new_parent, joint, placement, like=(source, child))
         carrier[parent] = (index, turn.inverse() * source.jointPlacements[child].inverse())
 
     def place(joint: int, placement: pin.SE3) -> tuple[int, pin.SE3]:
         """Return the new joint that carries `placement` of the old `joint`, and its placement."""
-        anchor = joint
+        anchor = joint  # nearest joint of the path; those between it and `joint` are locked
         while anchor not in carrier:
             anchor = source.parents[anchor]
-        new, body = carrier[anchor]
-        return new, round_placement(body * data.oMi[anchor].actInv(data.oMi[joint]) * placement)
+        new_joint, body = carrier[anchor]
+        joint_on_anchor = data.oMi[anchor].actInv(data.oMi[joint])
+        return new_joint, round_placement(body * joint_on_anchor * placement)
 
     for joint in range(source.njoints):
         if source.inertias[joint].mass > 0.0:
-            new, placement = place(joint, pin.SE3.Identity())
-            model.appendBodyToJoint(new, source.inertias[joint], placement)
-    frames: dict[int, int] = {}
+            new_joint, placement = place(joint, pin.SE3.Identity())
+            model.appendBodyToJoint(new_joint, source.inertias[joint], placement)
+    frames: dict[int, int] = {}  # frame of the object → frame of the new model
     for index, frame in enumerate(source.frames):
         if frame.type == pin.FrameType.BODY:
-            new, placement = place(frame.parentJoint, frame.placement)
-            body_frame = pin.Frame(frame.name, new, 0, placement, pin.FrameType.BODY)
+            new_joint, placement = place(frame.parentJoint, frame.placement)
+            body_frame = pin.Frame(frame.name, new_joint, 0, placement, pin.FrameType.BODY)
             frames[index] = model.addFrame(body_frame, False)
 
     collision = pin.GeometryModel()
@@ -158,17 +161,21 @@ def _align_with_z(model: pin.Model, data: pin.Data, index: int) -> tuple[pin.Joi
 
 
 def _rotate_z_to(axis: Floats) -> Floats:
-    """Return a rotation, shape (3, 3), from z to the unit vector `axis`, with many zeros."""
+    """Return a rotation, shape (3, 3), from z to the unit vector `axis`, with many zeros.
+
+    Its columns are x, y and z: x is the basis vector furthest from the axis, made perpendicular.
+    """
     basis = np.eye(3)
     x = basis[int(np.argmin(np.abs(axis)))]
     x = x - axis * (axis @ x)
     x = x / np.linalg.norm(x)
-    return np.column_stack([x, np.cross(axis, x), axis])
+    y = np.cross(axis, x)
+    return np.column_stack([x, y, axis])
 
 
 @dataclass(frozen=True, eq=False)
 class Closure:
-    """h_chain of eq. 2: target pose of a held object's base link.
+    """h_chain of eq. 2: target pose of a grasped object's base link.
 
     Attributes:
         joint: Joint of the chain that carries the base link.
@@ -244,20 +251,27 @@ class VirtualKinematicChain:
         Returns:
             Rotations, shape (W, J, 3, 3), and translations, shape (W, J, 3) [m].
         """
-        batch, joints = len(z), self.model.njoints
-        (columns,) = self._kinematics.batch(z)
-        columns = columns.reshape(batch, joints - 1, 12)
-        rotations, translations = np.zeros((batch, joints, 3, 3)), np.zeros((batch, joints, 3))
+        batch = len(z)
+        joints = self.model.njoints
+        (placements,) = self._kinematics.batch(z)
+        placements = placements.reshape(batch, joints - 1, 12)
+        rotations = np.zeros((batch, joints, 3, 3))
         rotations[:, 0] = np.eye(3)
-        rotations[:, 1:] = columns[..., :9].reshape(batch, joints - 1, 3, 3).swapaxes(2, 3)
-        translations[:, 1:] = columns[..., 9:]
+        # Nine numbers are the columns of R.
+        transposed = placements[..., :9].reshape(batch, joints - 1, 3, 3)
+        rotations[:, 1:] = transposed.swapaxes(2, 3)
+        translations = np.zeros((batch, joints, 3))
+        translations[:, 1:] = placements[..., 9:]
         return rotations, translations
 
     @cached_property
     def carries(self) -> Bools:
         """Mask of shape (J, J): whether joint j moves when joint k does."""
-        joints = range(self.model.njoints)
-        return np.array([[k in self.model.supports[j] for k in joints] for j in joints])
+        joints = self.model.njoints
+        carries = np.zeros((joints, joints), bool)
+        for j in range(joints):
+            carries[j, list(self.model.supports[j])] = True
+        return carries
 
     @cached_property
     def motions(self) -> tuple[Ints, Ints, Floats, Floats, Bools]:
@@ -266,23 +280,34 @@ class VirtualKinematicChain:
         Linear and angular velocity, shape (m, 3), are in the joint's frame, but the linear velocity
         of planar joints is along the world's axes: a mask, shape (m,).
         """
-        data, moves = self.model.createData(), self.coordinates.moves
+        data = self.model.createData()
+        moves = self.coordinates.moves
         pin.forwardKinematics(self.model, data, pin.neutral(self.model))
-        linear, angular = np.zeros((2, len(moves), 3))
-        fixed = np.zeros(len(moves), bool)
+        linear = np.zeros((len(moves), 3))
+        angular = np.zeros((len(moves), 3))
+        along_world = np.zeros(len(moves), bool)
         for row, move in enumerate(moves):
             if str(self.model.joints[move.joint].shortname()) == "JointModelPlanar":
-                part = move.coordinate - self.coordinates.joints.index(move.joint)
-                fixed[row] = part < 2
-                (linear if part < 2 else angular)[row, part] = 1.0
+                axis = move.coordinate - self.coordinates.joints.index(move.joint)
+                if axis < 2:  # x or y
+                    linear[row, axis] = 1.0
+                    along_world[row] = True
+                else:  # yaw, about z
+                    angular[row, axis] = 1.0
             else:
                 motion = np.asarray(data.joints[move.joint].S, float).ravel()
-                linear[row], angular[row] = motion[:3], motion[3:]
-        coordinates, joints = np.array([(move.coordinate, move.joint) for move in moves]).T
-        return coordinates, joints, linear, angular, fixed
+                linear[row] = motion[:3]
+                angular[row] = motion[3:]
+        coordinates = np.array([move.coordinate for move in moves])
+        joints = np.array([move.joint for move in moves])
+        return coordinates, joints, linear, angular, along_world
 
     def point_jacobians(self, z: Floats, which: Ints, joint: Ints, point: Floats) -> Floats:
         """Return the Jacobians of points that are fixed in joints' frames, shape (C, 3, n).
+
+        A joint at the translation t, which moves with the linear velocity v and the angular
+        velocity ω for a unit rate of a coordinate, all in the world, moves a point p that it
+        carries by v + ω × (p − t). A coordinate that several joints follow has the sum.
 
         Args:
             z: Configurations, shape (B, n).
@@ -290,14 +315,16 @@ class VirtualKinematicChain:
             joint: Joint that carries the point, shape (C,); 0 is the world.
             point: Position of the point in the world, shape (C, 3) [m].
         """
-        coordinate, owner, linear, angular, fixed = self.motions
+        coordinate, owner, linear, angular, along_world = self.motions
         rotations, translations = self.joint_placements(z)
         axes = rotations[:, owner]
-        translating = np.where(fixed[:, None], linear, np.einsum("bnij,nj->bni", axes, linear))
-        rotating = np.einsum("bnij,nj->bni", axes, angular)[which]
+        rotated_linear = np.einsum("bnij,nj->bni", axes, linear)
+        v = np.where(along_world[:, None], linear, rotated_linear)[which]
+        omega = np.einsum("bnij,nj->bni", axes, angular)[which]
         arm = point[:, None] - translations[:, owner][which]
-        motion = translating[which] + np.cross(rotating, arm)
+        motion = v + np.cross(omega, arm)
         motion = motion * self.carries[joint][:, owner, None]
+        # The motions are sorted by coordinate: add those of each.
         firsts = np.searchsorted(coordinate, np.arange(self.size))
         return np.asarray(np.add.reduceat(motion, firsts, axis=1).swapaxes(1, 2))
 
@@ -339,9 +366,11 @@ class VirtualKinematicChain:
         """
         if hold is None:
             model = self.robot.opened(opening).model  # the chain starts with the robot's joints
+            full_name = name
         else:
-            model, name = self.model, self.prefixes[hold] + name
-        frame = model.frames[model.getFrameId(name)]
+            model = self.model
+            full_name = self.prefixes[hold] + name
+        frame = model.frames[model.getFrameId(full_name)]
         return frame.parentJoint, pin.SE3(frame.placement)
 
 
@@ -352,15 +381,15 @@ def consolidate(
     rides: Iterable[SupportedObject] = (),
     cache: Cache | None = None,
 ) -> VirtualKinematicChain:
-    """Merge the scene's robot with the objects it holds into one model (section III of the paper).
+    """Merge the scene's robot with the objects it grasps into one model (paper, section III).
 
     Branches of an object that are not on the path from grasp to base are locked.
 
     Args:
         scene: Robot and placed objects.
         holds: All holds at any time, each after the hold it depends on; or object → attachment, all
-            held by the tool. Several holds become branches of one tree.
-        rides: Objects supported by links of held objects at any time.
+            grasped by the tool. Several holds become branches of one tree.
+        rides: Objects supported by links of grasped objects at any time.
         cache: Cache of the chain's kinematics. Defaults to one of its own.
 
     Raises:
@@ -368,68 +397,76 @@ def consolidate(
         InputError: Two grasps move the same joint, or a freedom of a grasp has the name of a joint.
     """
     robot = check_instance(scene, Scene, "scene").robot
-    holds = resolve_holds(scene.objects, make_holds(holds) if isinstance(holds, Mapping) else holds)
+    if isinstance(holds, Mapping):
+        holds = make_holds(holds)
+    holds = resolve_holds(scene.objects, holds)
     cache = Cache() if cache is None else check_instance(cache, Cache, "cache")
-    model, collision = pin.Model(robot.model), pin.GeometryModel()
-    shapes, joints = robot.collision.geometryObjects, list(range(model.njoints))
-    graft_geometry(collision, shapes, joints=joints, placement=pin.SE3.Identity())
+    model = pin.Model(robot.model)
+    collision = pin.GeometryModel()
+    graft_geometry(
+        collision,
+        robot.collision.geometryObjects,
+        joints=list(range(model.njoints)),
+        placement=pin.SE3.Identity(),
+    )
     names = list(robot.coordinates.names)
-    limits = [*zip(robot.lower, robot.upper, robot.velocity, robot.acceleration, strict=True)]
-    held_geometries, closures, virtual, hold_coordinates = {}, {}, {}, {}
+    limits = [*_list_limits(robot).values()]
+    held_geometries = {}
+    closures = {}
+    virtual = {}
+    hold_coordinates = {}
     prefixes: dict[Hold, str] = {}
     for hold in holds:
-        name, placed = hold.object, scene.objects[hold.object]
-        item, attachment = placed.object, get_attachment(scene.objects, hold)
-        # Pinocchio finds frames by unique names: a second branch of an object gets another prefix.
-        prefix = prefixes[hold] = name + "'" * sum(other.object == name for other in prefixes) + "."
+        name = hold.object
+        placed = scene.objects[name]
+        item = placed.object
+        attachment = get_attachment(scene.objects, hold)
+        prefix = _make_prefix(name, prefixes)
+        prefixes[hold] = prefix
         holder = robot.tool_frame if hold.by is None else f"{prefixes[hold.by]}{hold.link}"
+
+        # From the holder's frame to the object's link: offset⁻¹, J(v)⁻¹ and placement⁻¹ of the
+        # attachment, see `Attachment`.
         tool = model.frames[model.getFrameId(holder)]
-        placement = tool.placement * compute_hand_frame(robot, attachment)
+        hand = tool.placement * compute_hand_frame(robot, attachment)
+        grasp = hand * attachment.offset.inverse()
         parent, placement, added = _add_virtual_joint(
-            model, tool.parentJoint, placement * attachment.offset.inverse(), attachment, name
+            model, tool.parentJoint, grasp, attachment, name
         )
-        virtual[hold] = tuple(added)
-        limits += added.values()
-        tree, shapes = invert(item, attachment.link, placed.state)
         placement = round_placement(placement * attachment.placement.inverse())
+        tree, shapes = invert(item, attachment.link, placed.state)
         joints = graft(model, tree, parent=parent, placement=placement, prefix=prefix)
-        of_object = zip(item.lower, item.upper, item.velocity, item.acceleration, strict=True)
-        rows = dict(zip(item.coordinates.names, of_object, strict=True))
-        limits += [rows[joint] for joint in tree.names[1:]]
-        hold_coordinates[hold] = (*added, *(f"{name}.{joint}" for joint in tree.names[1:]))
+
+        path = tree.names[1:]
+        limits += added.values()
+        limits_by_joint = _list_limits(item)
+        limits += [limits_by_joint[joint] for joint in path]
+        virtual[hold] = tuple(added)
+        hold_coordinates[hold] = (*added, *(f"{name}.{joint}" for joint in path))
         names += hold_coordinates[hold]
+
         base = model.frames[model.getFrameId(f"{prefix}{item.base_link}")]
         moving = list(shapes.geometryObjects)
         if not item.free:
-            # Links that the held joints do not move (a door's frame, another door in it) are fixed
-            # in the world, whether or not the chain is closed.
+            # Links that these joints do not move (a door's frame, another door in it) are fixed in
+            # the world, whether or not the chain is closed.
             moving = [shape for shape in moving if joints[shape.parentJoint] != base.parentJoint]
-        held_geometries[hold] = tuple(
-            graft_geometry(collision, moving, joints=joints, placement=placement, prefix=prefix)
+        geometries = graft_geometry(
+            collision, moving, joints=joints, placement=placement, prefix=prefix
         )
-        target = placed.link_placement(item.base_link)
-        closures[hold] = Closure(base.parentJoint, pin.SE3(base.placement), target)
-    for name in names:
-        if names.count(name) > 1:
-            problem = (
-                "two coordinates share this name (two grasps of one joint, "
-                "or an attachment named like a joint of its object)"
-            )
-            raise InputError(problem, field=name, expected="unique coordinate names")
+        held_geometries[hold] = tuple(geometries)
+        closures[hold] = Closure(
+            joint=base.parentJoint,
+            local=pin.SE3(base.placement),
+            target=placed.link_placement(item.base_link),
+        )
+    _check_unique(names)
     ride_geometries = {}
-    for number, ride in enumerate(rides):
-        frame = model.frames[model.getFrameId(prefixes[ride.hold] + ride.link)]
-        placed = dataclasses.replace(
-            scene.objects[ride.object], placement=frame.placement * ride.placement_in_link
-        )
-        ride_geometries[ride] = tuple(
-            graft_geometry(
-                collision,
-                make_world_shapes(placed),
-                joints=[frame.parentJoint],
-                placement=pin.SE3.Identity(),
-                prefix=ride.object + "^" * (number + 1) + ".",
-            )
+    for number, supported in enumerate(rides):
+        link = model.frames[model.getFrameId(prefixes[supported.hold] + supported.link)]
+        prefix = supported.object + "^" * (number + 1) + "."
+        ride_geometries[supported] = _graft_supported_object(
+            scene, supported, collision, link, prefix
         )
     lower, upper, velocity, acceleration = np.array(limits, float).T.copy()
     return VirtualKinematicChain(
@@ -452,24 +489,85 @@ def consolidate(
     )
 
 
+def _list_limits(owner: Robot | ArticulatedObject) -> dict[str, tuple[float, ...]]:
+    """Return lower, upper, velocity and acceleration limit of each coordinate, by its name."""
+    limits = zip(owner.lower, owner.upper, owner.velocity, owner.acceleration, strict=True)
+    return dict(zip(owner.coordinates.names, limits, strict=True))
+
+
+def _make_prefix(name: str, prefixes: Mapping[Hold, str]) -> str:
+    """Return the prefix of the frames and joints of an object's next branch.
+
+    Pinocchio finds frames by unique names: a second branch of an object gets another prefix.
+    """
+    earlier_branches = sum(hold.object == name for hold in prefixes)
+    return name + "'" * earlier_branches + "."
+
+
+def _graft_supported_object(
+    scene: Scene,
+    supported: SupportedObject,
+    collision: pin.GeometryModel,
+    link: pin.Frame,
+    prefix: str,
+) -> tuple[int, ...]:
+    """Add the shapes of an object to the link on which it rests; return their indices."""
+    placement = link.placement * supported.placement_in_link
+    placed = dataclasses.replace(scene.objects[supported.object], placement=placement)
+    geometries = graft_geometry(
+        collision,
+        make_world_shapes(placed),
+        joints=[link.parentJoint],
+        placement=pin.SE3.Identity(),
+        prefix=prefix,
+    )
+    return tuple(geometries)
+
+
+def _check_unique(names: list[str]) -> None:
+    """Raise an `InputError` if two coordinates share a name."""
+    for name in names:
+        if names.count(name) > 1:
+            problem = (
+                "two coordinates share this name (two grasps of one joint, "
+                "or an attachment named like a joint of its object)"
+            )
+            raise InputError(problem, field=name, expected="unique coordinate names")
+
+
 def _add_virtual_joint(
     model: pin.Model, parent: int, placement: pin.SE3, attachment: Attachment, name: str
 ) -> tuple[int, pin.SE3, dict[str, tuple[float, float, float, float]]]:
     """Add J(v)⁻¹, tool to object: reversed joints with negated axes.
 
+    The grasp's own joint is J = J_1·…·J_k, each about or along an axis through a point of the
+    attachment's frame, so that J⁻¹ = J_k⁻¹·…·J_1⁻¹.
+
     Returns last joint, placement of the attachment on it, and coordinate names → limits.
     """
     added = {}
-    for suffix, freedom in reversed(
-        [*zip(attachment.coordinates, attachment.freedoms, strict=True)]
-    ):
-        revolute = freedom.kind == "revolute"
-        kind = pin.JointModelRevoluteUnaligned if revolute else pin.JointModelPrismaticUnaligned
-        low, high = freedom.lower, freedom.upper
-        bounds = [np.array([value]) for value in (np.inf, FREEDOM_VELOCITY, low, high)]
-        through = pin.SE3(np.eye(3), freedom.through)
-        at, joint_name = round_placement(placement * through), f"{name}.{suffix}"
-        parent = model.addJoint(parent, kind(-freedom.axis), at, joint_name, *bounds)
-        placement = through.inverse()
-        added[joint_name] = (low, high, FREEDOM_VELOCITY, FREEDOM_ACCELERATION)
+    freedoms = [*zip(attachment.coordinates, attachment.freedoms, strict=True)]
+    for suffix, freedom in reversed(freedoms):
+        kind = pin.JointModelPrismaticUnaligned
+        if freedom.kind == "revolute":
+            kind = pin.JointModelRevoluteUnaligned
+        joint_name = f"{name}.{suffix}"
+        to_axis = pin.SE3(np.eye(3), freedom.through)
+        parent = model.addJoint(
+            parent,
+            kind(-freedom.axis),
+            round_placement(placement * to_axis),
+            joint_name,
+            np.array([np.inf]),  # torque
+            np.array([FREEDOM_VELOCITY]),
+            np.array([freedom.lower]),
+            np.array([freedom.upper]),
+        )
+        placement = to_axis.inverse()
+        added[joint_name] = (
+            freedom.lower,
+            freedom.upper,
+            FREEDOM_VELOCITY,
+            FREEDOM_ACCELERATION,
+        )
     return parent, placement, added

@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import coal
 import numpy as np
@@ -48,10 +49,26 @@ from vkc_pin.world.task.lookup import find_joint_limits
 from vkc_pin.world.task.phases import Phase, Task
 
 REDUCED_MARGIN_RATIO = 0.5  # margin relative to the distance at the contact
+_POINT_RADIUS = 1e-4  # [m], of the sphere that stands for the target of a touch
 ReducedMargins = dict[int, list[tuple[int, int, float]]]
-# geometry of the chain, shape and placement at a contact, whether it is at the begin of the phase,
-# and whether the shapes may overlap
-_Contact = tuple[int, coal.CollisionGeometry, pin.SE3, bool, bool]
+
+
+class _Contact(NamedTuple):
+    """A geometry where it touches something at the begin or the end of a phase.
+
+    Attributes:
+        geometry: Geometry of the chain.
+        shape: Its shape, or a point for one that touches a target.
+        placement: Placement of the shape in the world at the contact.
+        begins: Whether the contact is at the begin of the phase; otherwise it is at the end.
+        may_overlap: Whether the shapes may overlap there.
+    """
+
+    geometry: int
+    shape: coal.CollisionGeometry
+    placement: pin.SE3
+    begins: bool
+    may_overlap: bool
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -88,25 +105,27 @@ class PhaseGeometry:
     def with_placements(self, placements: Mapping[int, pin.SE3]) -> PhaseGeometry:
         """Return a copy with some static geometries at other placements in the world."""
         shapes = list(self.shapes)
-        rotation, translation = self.rotation.copy(), self.translation.copy()
+        rotation = self.rotation.copy()
+        translation = self.translation.copy()
         for geometry, placement in placements.items():
             shapes[geometry] = pin.GeometryObject(shapes[geometry])
             shapes[geometry].placement = placement
-            rotation[geometry], translation[geometry] = placement.rotation, placement.translation
+            rotation[geometry] = placement.rotation
+            translation[geometry] = placement.translation
         moved = replace(self, shapes=tuple(shapes), rotation=rotation, translation=translation)
-        for name in ("_n_moving", "_pair_numbers", "margin_table"):  # independent of the placements
+        # Keep cached properties that do not depend on these placements.
+        for name in ("_n_moving", "_pair_numbers", "margin_table"):
             moved.__dict__[name] = getattr(self, name)
         which = np.array(list(placements), int)
-        moved.__dict__["boxes"] = self.boxes.move_fixed(
-            which, rotation[which], moved._box_centers[which]
-        )
+        boxes = self.boxes.move_fixed(which, rotation[which], moved._box_centers[which])
+        moved.__dict__["boxes"] = boxes
         return moved
 
     def find_static_near(self, reach: float, lower: Floats, upper: Floats) -> Ints:
         """Return static geometries within `reach` [m] of a box with given corners, (3,)."""
         lows, highs = self._static_boxes
-        near = (lows < (upper + reach)[:, None]) & (highs > (lower - reach)[:, None])
-        return np.flatnonzero(near.all(axis=0)) + self._n_moving
+        overlaps = (lows < (upper + reach)[:, None]) & (highs > (lower - reach)[:, None])
+        return np.flatnonzero(overlaps.all(axis=0)) + self._n_moving
 
     def find_pairs(self, first: int, seconds: Ints) -> Ints:
         """Return the existing pairs of a moving geometry with some static ones."""
@@ -137,17 +156,23 @@ class PhaseGeometry:
     def _pair_numbers(self) -> Ints:
         """Pair number of each moving with each static geometry, shape (M, S); -1: no pair."""
         moving = self._n_moving
-        number = np.full((moving, len(self.joint) - moving), -1)
-        (standing,) = np.nonzero(self.joint[self.pairs[:, 1]] == 0)
-        number[self.pairs[standing, 0], self.pairs[standing, 1] - moving] = standing
-        return number
+        numbers = np.full((moving, len(self.joint) - moving), -1)
+        is_static = self.joint[self.pairs[:, 1]] == 0
+        with_static = np.flatnonzero(is_static)
+        first, second = self.pairs[with_static].T
+        numbers[first, second - moving] = with_static
+        return numbers
 
     @cached_property
     def _static_boxes(self) -> tuple[Floats, Floats]:
-        """Lower and upper corners of the static axis-aligned boxes, shape (3, S) each [m]."""
-        standing = slice(self._n_moving, None)
-        extents = np.einsum("gij,gj->gi", np.abs(self.rotation[standing]), self.half[standing])
-        return (self._box_centers[standing] - extents).T, (self._box_centers[standing] + extents).T
+        """Lower and upper corners of the static axis-aligned boxes, shape (3, S) each [m].
+
+        A box of half extents h with the rotation R extends by |R| h along the world's axes.
+        """
+        static = slice(self._n_moving, None)
+        extents = np.einsum("gij,gj->gi", np.abs(self.rotation[static]), self.half[static])
+        centers = self._box_centers[static]
+        return (centers - extents).T, (centers + extents).T
 
 
 def find_reduced_margins(
@@ -166,32 +191,46 @@ def find_reduced_margins(
     contact. An initial penetration of a grasped object is allowed at the start. See
     `world.scene.contact_rules`.
     """
-    phase, reduced = task.phases[number], ReducedMargins()
-    first, steps = sum(p.segments for p in task.phases[:number]), options.steps(CONTACT_WINDOW)
+    phase = task.phases[number]
+    reduced = ReducedMargins()
+    first = sum(p.segments for p in task.phases[:number])
     last = first + phase.segments
-    windows = {True: (first, first + steps), False: (last - steps, last)}
-    for holds, begins in ((phase.released, True), (phase.grasps, False)):
+    steps = options.steps(CONTACT_WINDOW)
+    at_begin = (first, first + steps)
+    at_end = (last - steps, last)
+    for holds, window in ((phase.released, at_begin), (phase.grasps, at_end)):
         for hold in holds:
-            is_hand = np.isin(part.labels, list(find_touch_links(scene, hold)))
-            is_object = np.array([label.startswith(f"{hold.object}.") for label in part.labels])
-            found = np.flatnonzero(is_hand[part.pairs[:, 0]] & is_object[part.pairs[:, 1]])
-            for k in found.tolist():
-                margin = _compute_hand_margin(scene, hold, part.labels[part.pairs[k, 1]], options)
-                reduced.setdefault(k, []).append((*windows[begins], margin))
+            for k in _find_pairs_with_hand(scene, hold, part):
+                link = part.labels[part.pairs[k, 1]]
+                margin = _compute_hand_margin(scene, hold, link, options)
+                reduced.setdefault(k, []).append((*window, margin))
     reach = float(part.margins.max())
-    for moving, shape, where, begins, may_overlap in itertools.chain(
-        _find_supports(scene, chain, task, number, part), _find_touches(chain, task, number, part)
-    ):
-        nearby = part.find_static_near(reach, *compute_world_box(shape, where))
-        for k in part.find_pairs(moving, nearby).tolist():
+    supports = _find_supports(scene, chain, task, number, part)
+    touches = _find_touches(chain, task, number, part)
+    for contact in itertools.chain(supports, touches):
+        shape = contact.shape
+        window = at_begin if contact.begins else at_end
+        lower, upper = compute_world_box(shape, contact.placement)
+        nearby = part.find_static_near(reach, lower, upper)
+        for k in part.find_pairs(contact.geometry, nearby).tolist():
             other = part.shapes[int(part.pairs[k, 1])]
-            distance = compute_shape_distance(shape, where, other.geometry, other.placement)
+            distance = compute_shape_distance(
+                shape, contact.placement, other.geometry, other.placement
+            )
             margin = REDUCED_MARGIN_RATIO * max(distance, 0.0)
-            if may_overlap and distance < -CONTACT_DEPTH:
+            if contact.may_overlap and distance < -CONTACT_DEPTH:
                 margin = distance
             if distance < part.margins[k]:
-                reduced.setdefault(k, []).append((*windows[begins], margin))
+                reduced.setdefault(k, []).append((*window, margin))
     return reduced
+
+
+def _find_pairs_with_hand(scene: Scene, hold: Hold, part: PhaseGeometry) -> list[int]:
+    """Return the pairs of the hand (first) with the object that it grasps or releases."""
+    is_hand = np.isin(part.labels, list(find_touch_links(scene, hold)))
+    is_object = np.array([label.startswith(f"{hold.object}.") for label in part.labels])
+    first, second = part.pairs.T
+    return np.flatnonzero(is_hand[first] & is_object[second]).tolist()
 
 
 def _compute_hand_margin(scene: Scene, hold: Hold, link: str, options: Options) -> float:
@@ -209,16 +248,22 @@ def _find_touches(
     chain: VirtualKinematicChain, task: Task, number: int, part: PhaseGeometry
 ) -> Iterator[_Contact]:
     """Yield geometry that touches a target at the end or the begin of a phase."""
-    before = task.phases[number - 1].frames if number else ()
     goals = [(goal, False) for goal in task.phases[number].frames]
-    for goal, begins in (*goals, *((goal, True) for goal in before)):
+    if number:
+        goals += [(goal, True) for goal in task.phases[number - 1].frames]
+    for goal, begins in goals:
         if not goal.touches:
             continue
-        point, where = coal.Sphere(1e-4), pin.SE3(np.eye(3), goal.placement.translation)
+        point = coal.Sphere(_POINT_RADIUS)
+        where = pin.SE3(np.eye(3), goal.placement.translation)
         joint, _ = chain.frame(goal.frame, goal.hold)
         for i in range(len(chain.collision.geometryObjects)):
-            if part.labels[i] == str(goal) if goal.hold else part.shapes[i].parentJoint == joint:
-                yield i, point, where, begins, False
+            if goal.hold:
+                touches = part.labels[i] == str(goal)
+            else:
+                touches = part.shapes[i].parentJoint == joint
+            if touches:
+                yield _Contact(i, point, where, begins, may_overlap=False)
 
 
 def _find_supports(
@@ -231,7 +276,7 @@ def _find_supports(
         for i in geometries:
             where = placements[get_local_name(part.shapes[i].name)]
             may_overlap = begins and placed.name not in earlier
-            yield i, part.shapes[i].geometry, where, begins, may_overlap
+            yield _Contact(i, part.shapes[i].geometry, where, begins, may_overlap)
 
 
 def _find_lift_and_place_moments(
@@ -240,54 +285,61 @@ def _find_lift_and_place_moments(
     """Yield geometries, their object as placed, and whether it is lifted or placed then.
 
     These are the objects whose transport begins (True) or ends (False) in a phase. Transport of an
-    object held at the start begins in the first phase.
+    object grasped at the start begins in the first phase.
     """
     phase = task.phases[number]
-    at_start = {
-        hold: scene.objects[hold.object].placement
-        for hold in phase.held
-        if number == 0 and hold in scene.holds
-    }
+    at_start = {}
+    if number == 0:
+        for hold in phase.held:
+            if hold in scene.holds:
+                at_start[hold] = scene.objects[hold.object].placement
     for moments, begins in ((at_start, True), (phase.lifted, True), (phase.lowered, False)):
         for hold, placement in moments.items():
             if not scene.objects[hold.object].object.free:
                 continue
             placed = replace(scene.objects[hold.object], placement=placement)
             yield chain.held_geometries[hold], placed, begins
-            for ride in phase.supported:
-                if ride.hold == hold:
-                    supported = _place_supported_object(scene, ride, placed)
-                    yield chain.ride_geometries[ride], supported, begins
-    for ride in phase.supported:
-        carrier = scene.objects[ride.hold.object]
-        if not carrier.object.free:
-            goals = {
-                name: float(np.clip(value, *find_joint_limits(carrier, name)))
-                for name, value in phase.values.items()
-                if name.partition(".")[0] == carrier.name
-            }
-            final_values = {**phase.initial_values, **goals}
-            for state, begins in ((phase.initial_values, True), (final_values, False)):
-                placed = _with_joint_positions(carrier, state)
-                placed = _place_supported_object(scene, ride, placed)
-                yield chain.ride_geometries[ride], placed, begins
+            for supported in phase.supported:
+                if supported.hold == hold:
+                    placed_on_it = _place_supported_object(scene, supported, placed)
+                    yield chain.ride_geometries[supported], placed_on_it, begins
+    for supported in phase.supported:
+        carrier = scene.objects[supported.hold.object]
+        if carrier.object.free:
+            continue
+        final_values = _predict_final_values(phase, carrier)
+        for values, begins in ((phase.initial_values, True), (final_values, False)):
+            carrier_then = carrier.with_state(_select_joint_values(values, carrier.name))
+            placed_on_it = _place_supported_object(scene, supported, carrier_then)
+            yield chain.ride_geometries[supported], placed_on_it, begins
+
+
+def _predict_final_values(phase: Phase, placed: PlacedObject) -> dict[str, float]:
+    """Return coordinate → value at the end of a phase, with the goals of one object reached."""
+    final_values = dict(phase.initial_values)
+    for name, value in phase.values.items():
+        if name.partition(".")[0] == placed.name:
+            lower, upper = find_joint_limits(placed, name)
+            final_values[name] = float(np.clip(value, lower, upper))
+    return final_values
 
 
 def _place_supported_object(
-    scene: Scene, ride: SupportedObject, carrier: PlacedObject
+    scene: Scene, supported: SupportedObject, carrier: PlacedObject
 ) -> PlacedObject:
     """Return the supported object, placed on its carrier."""
-    return replace(
-        scene.objects[ride.object],
-        placement=carrier.link_placement(ride.link) * ride.placement_in_link,
-    )
+    placement = carrier.link_placement(supported.link) * supported.placement_in_link
+    return replace(scene.objects[supported.object], placement=placement)
 
 
-def _with_joint_positions(placed: PlacedObject, state: Mapping[str, float]) -> PlacedObject:
-    """Return an object with those of the positions "<object>.<joint>" that are its own."""
-    return placed.with_state(
-        {c.partition(".")[2]: v for c, v in state.items() if c.partition(".")[0] == placed.name}
-    )
+def _select_joint_values(values: Mapping[str, float], owner: str) -> dict[str, float]:
+    """Return joint → value of one object, of values by "<object>.<joint>"."""
+    selected = {}
+    for name, value in values.items():
+        object_name, _, joint = name.partition(".")
+        if object_name == owner:
+            selected[joint] = value
+    return selected
 
 
 def build_phase_geometries(
@@ -306,26 +358,22 @@ class _PairBuilder:
     def __init__(
         self, scene: Scene, chain: VirtualKinematicChain, task: Task, options: Options
     ) -> None:
-        self.scene, self.chain, self.task, self.options = scene, chain, task, options
-        self.first_waypoint = np.concatenate(
-            [[0], np.cumsum([phase.segments for phase in task.phases])]
-        )
-        self._labels = [
-            scene.robot.link_of(i) for i in range(len(scene.robot.collision.geometryObjects))
-        ]
-        held = [(hold.object, indices) for hold, indices in chain.held_geometries.items()]
-        supported = [(ride.object, indices) for ride, indices in chain.ride_geometries.items()]
-        for name, indices in (*held, *supported):
-            self._labels += [
-                f"{name}.{get_link_name(get_local_name(chain.collision.geometryObjects[i].name))}"
-                for i in indices
-            ]
-        self._allowances = find_clearance_exemptions(scene, options.dist_safe)
+        self.scene = scene
+        self.chain = chain
+        self.task = task
+        self.options = options
+        geometries = chain.collision.geometryObjects
+        self._robot_geometries = range(len(scene.robot.collision.geometryObjects))
+        self._labels = [scene.robot.link_of(i) for i in self._robot_geometries]
+        for moved in (chain.held_geometries, chain.ride_geometries):
+            for hold_or_supported, indices in moved.items():
+                for i in indices:
+                    link = get_link_name(get_local_name(geometries[i].name))
+                    self._labels.append(f"{hold_or_supported.object}.{link}")
+        self._exemptions = find_clearance_exemptions(scene, options.dist_safe)
         self._obstacles = scene.obstacles
-        self._compute_boxes = (
-            _compute_boxes([*chain.collision.geometryObjects]),
-            _compute_boxes(self._obstacles),
-        )
+        self._boxes_of_chain = _compute_boxes([*geometries])
+        self._boxes_of_obstacles = _compute_boxes(self._obstacles)
 
     def _pair_moving_shapes(
         self, phase: Phase, shapes: Sequence[pin.GeometryObject]
@@ -335,113 +383,90 @@ class _PairBuilder:
         Returns:
             Pairs of shapes with their margins [m], and attached or supported object → its shapes.
         """
-        scene, chain, labels = self.scene, self.chain, self._labels
+        chain = self.chain
+        labels = self._labels
         margin = self.options.dist_safe
-        pairs = [
-            (*pair, own_margin)
-            for pair, own_margin in scene.robot.own_margins(self.options.self_distance).items()
-        ]
+        pairs = list[tuple[int, int, float]]()
+        own_margins = self.scene.robot.own_margins(self.options.self_distance)
+        for (i, j), own_margin in own_margins.items():
+            pairs.append((i, j, own_margin))
         attached_shapes: dict[str, tuple[int, ...]] = {}
-        moving = list(range(len(scene.robot.collision.geometryObjects)))
+        moving = list(self._robot_geometries)
         for hold in phase.held:
-            attached_shapes[hold.object] = chain.held_geometries[hold]
-            pairs += [
-                (i, j, self._find_attached_margin(hold, labels[i], labels[j]))
-                for i in moving
-                for j in attached_shapes[hold.object]
-            ]
-            pairs += [
-                (i, j, margin)
-                for i, j in itertools.combinations(attached_shapes[hold.object], 2)
-                if self._can_self_collide(hold.object, labels[i], labels[j])
-            ]
-            moving += attached_shapes[hold.object]
-        for ride in phase.supported:
-            attached_shapes[ride.object] = chain.ride_geometries[ride]
+            grasped = chain.held_geometries[hold]
+            attached_shapes[hold.object] = grasped
+            for i, j in itertools.product(moving, grasped):
+                pairs.append((i, j, self._find_attached_margin(hold, labels[i], labels[j])))
+            for i, j in itertools.combinations(grasped, 2):
+                if self._can_self_collide(hold.object, labels[i], labels[j]):
+                    pairs.append((i, j, margin))
+            moving += grasped
+        for supported in phase.supported:
+            on_it = chain.ride_geometries[supported]
+            attached_shapes[supported.object] = on_it
             # The object moves rigidly with geometry on these joints.
-            same_joint = {shapes[j].parentJoint for j in attached_shapes[ride.object]}
-            pairs += [
-                (i, j, margin)
-                for i in moving
-                if shapes[i].parentJoint not in same_joint
-                for j in attached_shapes[ride.object]
-            ]
-            moving += attached_shapes[ride.object]
+            same_joint = {shapes[j].parentJoint for j in on_it}
+            for i, j in itertools.product(moving, on_it):
+                if shapes[i].parentJoint not in same_joint:
+                    pairs.append((i, j, margin))
+            moving += on_it
         return pairs, attached_shapes
 
     def build_phase(self, number: int) -> PhaseGeometry:
-        phase, scene, chain = self.task.phases[number], self.scene, self.chain
-        holds = {hold.object: hold for hold in phase.held}
-        shapes = list(chain.get_collision_geometry(phase.opening).geometryObjects)
-        labels = list(self._labels)
-        of_chain = self._compute_boxes[0] if phase.opening is None else _compute_boxes(shapes)
-        robots = range(len(scene.robot.collision.geometryObjects))
-        own = len(shapes)
-        margin = self.options.dist_safe
+        phase = self.task.phases[number]
+        shapes = list(self.chain.get_collision_geometry(phase.opening).geometryObjects)
+        boxes_of_chain = self._boxes_of_chain
+        if phase.opening is not None:
+            boxes_of_chain = _compute_boxes(shapes)
         pairs, attached_shapes = self._pair_moving_shapes(phase, shapes)
-        moving = [*robots, *itertools.chain.from_iterable(attached_shapes.values())]
         pairs = [pair for pair in pairs if np.isfinite(pair[2])]
-        left: dict[str, tuple[int, ...]] = {}
-        for name, placed in scene.objects.items():
-            state = {
-                c.removeprefix(f"{name}."): v
-                for c, v in phase.initial_values.items()
-                if c.startswith(f"{name}.")
-            }
-            if placed.object.free:
-                if name in attached_shapes:
-                    continue
-                placed = replace(placed, placement=phase.resting.get(name, placed.placement))
-            standing = make_world_shapes(placed.with_state(state))
-            if name in attached_shapes:  # its static links; the others move with the hand
-                held_shapes = {get_local_name(shapes[i].name) for i in attached_shapes[name]}
-                standing = [shape for shape in standing if shape.name not in held_shapes]
+        moving = [
+            *self._robot_geometries,
+            *itertools.chain.from_iterable(attached_shapes.values()),
+        ]
+
+        labels = list(self._labels)
+        static_shapes = list[pin.GeometryObject]()
+        released: dict[str, tuple[int, ...]] = {}
+        holds = {hold.object: hold for hold in phase.held}
+        for name, placed in self.scene.objects.items():
+            if placed.object.free and name in attached_shapes:
+                continue  # all of it moves
+            static_of_object = self._make_static_shapes(phase, name, shapes, attached_shapes)
+            first = len(shapes) + len(static_shapes)
             if name in phase.released_by:
-                left[name] = tuple(range(len(shapes), len(shapes) + len(standing)))
-            for shape in standing:
+                released[name] = tuple(range(first, first + len(static_of_object)))
+            for index, shape in enumerate(static_of_object, start=first):
                 label = f"{name}.{get_link_name(shape.name)}"
-                others = [
-                    i
-                    for i in moving
-                    if i not in attached_shapes.get(name, ())
-                    or self._can_self_collide(name, labels[i], label)
-                ]
-                held = holds.get(name)  # the hand moves only some of its joints
-                pairs += [
-                    (
-                        i,
-                        len(shapes),
-                        self._find_attached_margin(held, labels[i], label) if held else margin,
-                    )
-                    for i in others
-                ]
+                for i in moving:
+                    is_same_object = i in attached_shapes.get(name, ())
+                    if is_same_object and not self._can_self_collide(name, labels[i], label):
+                        continue
+                    margin = self.options.dist_safe
+                    if name in holds:  # the hand moves only some of its joints
+                        margin = self._find_attached_margin(holds[name], labels[i], label)
+                    pairs.append((i, index, margin))
                 shape.name = f"{name}.{shape.name}"
-                shapes.append(shape)
+                static_shapes.append(shape)
                 labels.append(label)
         record_evaluations()
-        free_shapes = {
-            i
-            for name, indices in attached_shapes.items()
-            if scene.objects[name].object.free
-            for i in indices
-        }
-        arm_shapes = {i for i in robots if shapes[i].parentJoint > 1}
-        floor_movers = [i for i in moving if i in free_shapes | arm_shapes]
-        with_obstacles = self._pair_with_obstacles(len(shapes), moving, floor_movers)
+
+        boxes_of_static = _compute_boxes(static_shapes)
+        boxes = zip(boxes_of_chain, boxes_of_static, self._boxes_of_obstacles, strict=True)
+        center, half, rotation, translation = (np.concatenate(parts) for parts in boxes)
+        first_obstacle = len(shapes) + len(static_shapes)
+        floor_movers = self._find_floor_movers(shapes, moving, attached_shapes)
+        with_obstacles = self._pair_with_obstacles(first_obstacle, moving, floor_movers)
         table = np.concatenate([np.array(pairs).reshape(-1, 3), with_obstacles])
-        labels += scene.obstacle_labels
-        names = [shape.name for shape in shapes] + [shape.name for shape in self._obstacles]
-        table, margin_regions = self._apply_exemptions(
-            phase, table, labels, make_shape_keys(labels, names)
-        )
+        shapes += [*static_shapes, *self._obstacles]
+        labels += self.scene.obstacle_labels
+        keys = make_shape_keys(labels, [shape.name for shape in shapes])
+        table, margin_regions = self._apply_exemptions(phase, table, labels, keys)
         if not len(table):
             expected = "collision geometry in robot or scene"
             raise InputError(
                 "no pair of geometries can collide", field=phase.name, expected=expected
             )
-        boxes = zip(of_chain, _compute_boxes(shapes[own:]), self._compute_boxes[1], strict=True)
-        center, half, rotation, translation = (np.concatenate(parts) for parts in boxes)
-        shapes += self._obstacles
         part = PhaseGeometry(
             shapes=tuple(shapes),
             labels=tuple(labels),
@@ -453,14 +478,43 @@ class _PairBuilder:
             rotation=rotation,
             translation=translation,
             margin_regions=margin_regions,
-            released=left,
+            released=released,
         )
-        return replace(
-            part,
-            reduced_margins=find_reduced_margins(
-                self.scene, self.chain, self.task, number, part, self.options
-            ),
+        reduced_margins = find_reduced_margins(
+            self.scene, self.chain, self.task, number, part, self.options
         )
+        return replace(part, reduced_margins=reduced_margins)
+
+    def _make_static_shapes(
+        self,
+        phase: Phase,
+        name: str,
+        shapes: Sequence[pin.GeometryObject],
+        attached_shapes: Mapping[str, tuple[int, ...]],
+    ) -> list[pin.GeometryObject]:
+        """Return the geometry of an object that is fixed in the world during a phase."""
+        placed = self.scene.objects[name]
+        if placed.object.free:
+            placed = replace(placed, placement=phase.resting.get(name, placed.placement))
+        values = _select_joint_values(phase.initial_values, name)
+        static = make_world_shapes(placed.with_state(values))
+        if name in attached_shapes:  # its static links; the others move with the hand
+            moving_names = {get_local_name(shapes[i].name) for i in attached_shapes[name]}
+            static = [shape for shape in static if shape.name not in moving_names]
+        return static
+
+    def _find_floor_movers(
+        self,
+        shapes: Sequence[pin.GeometryObject],
+        moving: Sequence[int],
+        attached_shapes: Mapping[str, tuple[int, ...]],
+    ) -> list[int]:
+        """Return the moving geometry that must not touch the floor: arm and free objects."""
+        movers = {i for i in self._robot_geometries if shapes[i].parentJoint > 1}
+        for name, indices in attached_shapes.items():
+            if self.scene.objects[name].object.free:
+                movers.update(indices)
+        return [i for i in moving if i in movers]
 
     def _find_attached_margin(self, hold: Hold, one: str, link: str) -> float:
         """Return the clearance [m] between label `one` and label `link` of a grasped object.
@@ -480,29 +534,34 @@ class _PairBuilder:
         self, phase: Phase, table: Floats, labels: Sequence[str], keys: Sequence[str]
     ) -> tuple[Floats, list[MarginRegion]]:
         """Return pairs with the scene's margins, and the joint-dependent exemptions."""
-        if not self._allowances:
+        if not self._exemptions:
             return table, []
-        base = len(labels)
+        # A pair (i, j), i < j, of G geometries has the key i·G + j.
+        count = len(labels)
         pairs = table[:, :2].astype(int)
-        own = pairs.min(axis=1) * base + pairs.max(axis=1)
+        pair_keys = pairs.min(axis=1) * count + pairs.max(axis=1)
         rows = {}
-        for one in self._allowances:
-            exempt = np.array(one.find_shape_pairs(labels, keys), int).reshape(-1, 2)
-            rows[one] = np.flatnonzero(np.isin(own, exempt[:, 0] * base + exempt[:, 1]))
-        for one in self._allowances:
-            if not one.ranges:
-                table[rows[one], 2] = np.minimum(table[rows[one], 2], one.margin)
-        kept = np.isfinite(table[:, 2])
-        place, margin_regions = np.where(kept, np.cumsum(kept) - 1, -1), []
-        for one in self._allowances:
-            exempt_pairs = place[rows[one]][kept[rows[one]]]
-            resolved = self._resolve_ranges(phase, one.ranges)
-            if one.ranges and len(exempt_pairs) and resolved is not None:
-                margin = (
-                    one.margin if one.margin < 0.0 else REDUCED_MARGIN_RATIO * max(one.nearest, 0.0)
-                )
+        for exemption in self._exemptions:
+            exempt = np.array(exemption.find_shape_pairs(labels, keys), int).reshape(-1, 2)
+            exempt_keys = exempt[:, 0] * count + exempt[:, 1]
+            rows[exemption] = np.flatnonzero(np.isin(pair_keys, exempt_keys))
+        for exemption in self._exemptions:
+            if not exemption.ranges:
+                exempt_rows = rows[exemption]
+                table[exempt_rows, 2] = np.minimum(table[exempt_rows, 2], exemption.margin)
+        is_kept = np.isfinite(table[:, 2])
+        new_rows = np.cumsum(is_kept) - 1  # of the pairs that are kept
+        margin_regions = []
+        for exemption in self._exemptions:
+            exempt_rows = rows[exemption]
+            exempt_pairs = new_rows[exempt_rows[is_kept[exempt_rows]]]
+            resolved = self._resolve_ranges(phase, exemption.ranges)
+            if exemption.ranges and len(exempt_pairs) and resolved is not None:
+                margin = exemption.margin
+                if margin >= 0.0:
+                    margin = REDUCED_MARGIN_RATIO * max(exemption.nearest, 0.0)
                 margin_regions.append(MarginRegion(exempt_pairs, margin, *resolved))
-        return table[kept], margin_regions
+        return table[is_kept], margin_regions
 
     def _resolve_ranges(
         self, phase: Phase, ranges: Mapping[str, tuple[float, float]]
@@ -511,28 +570,27 @@ class _PairBuilder:
 
         Returns None if a coordinate that is not in the chain is outside its range.
         """
-        columns, limits = list[int](), list[tuple[float, float]]()
+        columns = list[int]()
+        lower_limits = list[float]()
+        upper_limits = list[float]()
         for name, (lower, upper) in ranges.items():
             if name in self.chain.names:
                 columns.append(self.chain.index(name))
-                limits.append((lower, upper))
+                lower_limits.append(lower)
+                upper_limits.append(upper)
                 continue
             owner, _, joint = name.partition(".")
             placed = self.scene.objects[owner]
-            value = phase.initial_values.get(
-                name, float(placed.state[placed.object.coordinates.index(joint)])
-            )
+            at_start = float(placed.state[placed.object.coordinates.index(joint)])
+            value = phase.initial_values.get(name, at_start)
             if not lower <= value <= upper:
                 return None
-        low, high = np.array(limits).reshape(-1, 2).T
-        return np.array(columns, int), low, high
+        return np.array(columns, int), np.array(lower_limits), np.array(upper_limits)
 
     def _can_self_collide(self, name: str, first: str, second: str) -> bool:
         """Return whether two links of an object, given by labels, can collide."""
-        return (
-            frozenset(label.partition(".")[2] for label in (first, second))
-            in self.scene.objects[name].object.own_pairs
-        )
+        links = frozenset(label.partition(".")[2] for label in (first, second))
+        return links in self.scene.objects[name].object.own_pairs
 
     def _pair_with_obstacles(
         self, first: int, moving: Sequence[int], floor_movers: Sequence[int]
@@ -542,13 +600,15 @@ class _PairBuilder:
         Only `floor_movers` are paired with the floor: wheels stand on it, and the gap below doors
         is as modelled.
         """
-        ones, others = np.array(moving, int), np.arange(len(self._obstacles))
+        obstacle_count = len(self._obstacles)
+        movers = np.tile(np.array(moving, int), obstacle_count)
+        obstacles = np.repeat(np.arange(obstacle_count), len(moving))
         is_floor = np.array([label == FLOOR for label in self.scene.obstacle_labels], bool)
-        pairs = np.column_stack([np.tile(ones, len(others)), np.repeat(others, len(ones))])
-        pairs = pairs[~is_floor[pairs[:, 1]] | np.isin(pairs[:, 0], floor_movers)]
-        return np.column_stack(
-            [pairs[:, 0], first + pairs[:, 1], np.full(len(pairs), self.options.dist_safe)]
-        )
+        is_pair = ~is_floor[obstacles] | np.isin(movers, floor_movers)
+        movers = movers[is_pair]
+        obstacles = obstacles[is_pair]
+        margins = np.full(len(movers), self.options.dist_safe)
+        return np.column_stack([movers, first + obstacles, margins])
 
 
 def _compute_boxes(shapes: Sequence[pin.GeometryObject]) -> tuple[Floats, ...]:

@@ -2,14 +2,13 @@
 
 For a pair (A, B) coal gives witness points a, b and the normal n of the distance n·(b − a). With a
 fixed in A, b in B and n in the world, n·(b(z) − a(z)) has the distance's value and gradient, and is
-linear in the joint placements: C·vec(M(z)) − R.
+linear in the joint placements: C·vec(M(z)) − R, see `ContactModel.compute_planes`.
 """
 
 from __future__ import annotations
 
 import copy
 import dataclasses
-import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +23,7 @@ from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.utils.budget import record_evaluations
 from vkc_pin.world.collision.distances import Clearances, Shapes
 from vkc_pin.world.collision.solids import ShapePlacements
+from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Task
@@ -60,7 +60,7 @@ class Contacts:
 
     def select(self, index: Ints) -> Contacts:
         """Return the contacts at `index`, in that order."""
-        return Contacts(*(array[index] for array in self.arrays()))
+        return Contacts(*[array[index] for array in self.arrays()])
 
     @property
     def slot(self) -> Ints:
@@ -84,8 +84,17 @@ class Contacts:
 
 def make_empty_contacts() -> Contacts:
     """Return an empty set of contacts."""
-    none, vectors = np.zeros(0), np.zeros((0, 3))
-    return Contacts(np.zeros(0, int), np.zeros((0, 2), int), none, none, vectors, vectors, vectors)
+    scalars = np.zeros(0)
+    vectors = np.zeros((0, 3))
+    return Contacts(
+        waypoint=np.zeros(0, int),
+        pair=np.zeros((0, 2), int),
+        distance=scalars,
+        margin=scalars,
+        normal=vectors,
+        first=vectors,
+        second=vectors,
+    )
 
 
 class ContactModel:
@@ -99,30 +108,33 @@ class ContactModel:
     def __init__(
         self, scene: Scene, chain: VirtualKinematicChain, task: Task, options: Options
     ) -> None:
-        self.scene, self.chain, self.task = scene, chain, task
-        self.first_waypoint = np.concatenate(
-            [[0], np.cumsum([phase.segments for phase in task.phases])]
-        )
-        placed = {
-            opening: ShapePlacements(chain.model, chain.get_collision_geometry(opening))
-            for opening in dict.fromkeys(phase.opening for phase in task.phases)
-        }
+        self.scene = scene
+        self.chain = chain
+        self.task = task
+        segments = [phase.segments for phase in task.phases]
+        self.first_waypoint = np.concatenate([[0], np.cumsum(segments)])
+        placements_by_opening = dict[float | None, ShapePlacements]()
+        for phase in task.phases:
+            if phase.opening not in placements_by_opening:
+                geometry = chain.get_collision_geometry(phase.opening)
+                placements_by_opening[phase.opening] = ShapePlacements(chain.model, geometry)
         self.phases = build_phase_geometries(scene, chain, task, options)
         self._clearances = [
-            self._make_clearances(part, placed[phase.opening])
+            self._make_clearances(part, placements_by_opening[phase.opening])
             for part, phase in zip(self.phases, task.phases, strict=True)
         ]
-        own = [shape.parentJoint for shape in chain.collision.geometryObjects]
-        n_fixed = max(len(part.labels) for part in self.phases) - len(own)
-        self._joints = np.array(own + [0] * n_fixed)
+        # Joint of each geometry: those of the chain come first, the others are static.
+        joints_of_chain = [shape.parentJoint for shape in chain.collision.geometryObjects]
+        geometry_count = max(len(part.labels) for part in self.phases)
+        self._joints = np.zeros(geometry_count, int)
+        self._joints[: len(joints_of_chain)] = joints_of_chain
 
-    def _make_clearances(self, part: PhaseGeometry, placed: ShapePlacements) -> Clearances:
+    def _make_clearances(self, part: PhaseGeometry, placements: ShapePlacements) -> Clearances:
         moving = len(self.chain.collision.geometryObjects)
-        standing = [shape.placement for shape in part.shapes[moving:]]
-        shapes = Shapes(
-            [shape.geometry for shape in part.shapes], standing, tolerance=_DISTANCE_TOLERANCE
-        )
-        return Clearances(placed, part.boxes, shapes, part.margin_table)
+        geometries = [shape.geometry for shape in part.shapes]
+        static_placements = [shape.placement for shape in part.shapes[moving:]]
+        shapes = Shapes(geometries, static_placements, tolerance=_DISTANCE_TOLERANCE)
+        return Clearances(placements, part.boxes, shapes, part.margin_table)
 
     def with_released_objects(self, z: Floats) -> ContactModel:
         """Return a copy with released objects where the motion z_1..z_N, shape (N, n), puts them.
@@ -133,30 +145,37 @@ class ContactModel:
         if not any(phase.released_by for phase in self.task.phases):
             return self
         view = copy.copy(self)
-        view.phases, view._clearances = list(self.phases), list(self._clearances)
+        view.phases = list(self.phases)
+        view._clearances = list(self._clearances)
         for number, phase in enumerate(self.task.phases):
             where: dict[int, pin.SE3] = {}
             for name, (hold, before) in phase.released_by.items():
-                closure = self.chain.closures[hold]
-                rotations, translations = self.chain.joint_placements(
-                    z[[self.first_waypoint[before + 1] - 1]]
-                )
-                carrier = pin.SE3(rotations[0, closure.joint], translations[0, closure.joint])
-                placed = dataclasses.replace(
-                    self.scene.objects[name], placement=carrier * closure.local
-                )
+                release = self.first_waypoint[before + 1] - 1  # row of z
+                placement = self._compute_object_placement(z[[release]], hold)
+                placed = dataclasses.replace(self.scene.objects[name], placement=placement)
                 placements = [shape.placement for shape in make_world_shapes(placed)]
                 where |= zip(self.phases[number].released[name], placements, strict=True)
             if where:
-                view.phases[number] = part = self.phases[number].with_placements(where)
+                part = self.phases[number].with_placements(where)
+                view.phases[number] = part
                 view._clearances[number] = self._clearances[number].move_fixed(part.boxes, where)
         return view
 
+    def _compute_object_placement(self, z: Floats, hold: Hold) -> pin.SE3:
+        """Return the placement of a grasped object in the world at one configuration, (1, n)."""
+        closure = self.chain.closures[hold]
+        rotations, translations = self.chain.joint_placements(z)
+        carrier = pin.SE3(rotations[0, closure.joint], translations[0, closure.joint])
+        return carrier * closure.local
+
     def find_attached_geometries(self, phase: int) -> list[int]:
         """Return the geometries of grasped objects in a phase and of objects supported by them."""
-        held, supported = self.task.phases[phase].held, self.task.phases[phase].supported
-        found = [self.chain.held_geometries[hold] for hold in held]
-        return [*itertools.chain(*found, *(self.chain.ride_geometries[ride] for ride in supported))]
+        geometries = list[int]()
+        for hold in self.task.phases[phase].held:
+            geometries += self.chain.held_geometries[hold]
+        for supported in self.task.phases[phase].supported:
+            geometries += self.chain.ride_geometries[supported]
+        return geometries
 
     def find_phase(self, waypoint: int) -> int:
         """Return the phase of a waypoint: at a boundary the earlier one, before the grasp."""
@@ -191,15 +210,14 @@ class ContactModel:
                 two moving geometries.
         """
         record_evaluations(len(z))
-        q, phase_of = self.chain.coordinates.q(z), self.find_phases(waypoints)
+        q = self.chain.coordinates.q(z)
+        phase_of = self.find_phases(waypoints)
         parts: list[tuple[NDArray[Any], ...]] = []
         for number in dict.fromkeys(phase_of.tolist()):
             members = np.flatnonzero(phase_of == number)
-            queries = (
-                (q, z, waypoints)
-                if len(members) == len(z)
-                else (q[members], z[members], waypoints[members])
-            )
+            queries = (q, z, waypoints)
+            if len(members) < len(z):
+                queries = (q[members], z[members], waypoints[members])
             found = self._clearances[number].find_closest_pairs(
                 *queries, reach=reach, max_pairs=nearest, include_fixed=static
             )
@@ -209,8 +227,9 @@ class ContactModel:
             return Contacts(*parts[0])
         if not parts:
             return make_empty_contacts()
-        columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
-        return Contacts(*columns).select(np.argsort(columns[0], kind="stable"))
+        contacts = Contacts(*[np.concatenate(column) for column in zip(*parts, strict=True)])
+        by_waypoint = np.argsort(contacts.waypoint, kind="stable")
+        return contacts.select(by_waypoint)
 
     def count_free(
         self, z: Floats, edges: Ints, waypoint: int, *, reach: float, allowed: float
@@ -237,12 +256,13 @@ class ContactModel:
 
         CasADi prepares a function anew for each batch size.
         """
-        parts = [
-            self.chain.joint_placements(z[row : row + _KINEMATICS_BATCH])
-            for row in range(0, max(len(z), 1), _KINEMATICS_BATCH)
-        ]
-        rotations, translations = map(np.concatenate, zip(*parts, strict=True))
-        return rotations, translations
+        rotations = []
+        translations = []
+        for row in range(0, max(len(z), 1), _KINEMATICS_BATCH):
+            batch = self.chain.joint_placements(z[row : row + _KINEMATICS_BATCH])
+            rotations.append(batch[0])
+            translations.append(batch[1])
+        return np.concatenate(rotations), np.concatenate(translations)
 
     def get_joints(self, geometries: Ints) -> Ints:
         """Return the chain's joints that carry `geometries`; 0 for geometry fixed in the world."""
@@ -253,25 +273,35 @@ class ContactModel:
         joints = self.get_joints(contacts.pair)
         which = np.tile(contacts.waypoint, 2)
         points = np.concatenate([contacts.first, contacts.second])
-        first, second = np.split(self.chain.point_jacobians(z, which, joints.T.ravel(), points), 2)
+        jacobians = self.chain.point_jacobians(z, which, joints.T.ravel(), points)
+        first, second = np.split(jacobians, 2)
         return np.asarray(np.einsum("ci,cij->cj", contacts.normal, second - first))
 
     def compute_normals(self, z: Floats, waypoints: Ints, pairs: Ints) -> Floats:
         """Return the normal, from first to second, of one pair per configuration, shape (B, 3)."""
-        found, phase_of = np.empty((len(z), 3)), self.find_phases(waypoints)
+        normals = np.empty((len(z), 3))
+        phase_of = self.find_phases(waypoints)
         for number in set(phase_of.tolist()):
             members = np.flatnonzero(phase_of == number)
-            clearances, rows = self._clearances[number], np.arange(len(members))
+            clearances = self._clearances[number]
             q = self.chain.coordinates.q(z[members])
             where = clearances.placements.compute_placements(q)
-            found[members] = clearances.shapes.compute_witnesses(where, rows, pairs[members]).normal
-        return found
+            rows = np.arange(len(members))
+            witnesses = clearances.shapes.compute_witnesses(where, rows, pairs[members])
+            normals[members] = witnesses.normal
+        return normals
 
     def compute_planes(self, z: Floats, contacts: Contacts, *, slots: int) -> tuple[Floats, Floats]:
         """Return the witness planes of the nearest contacts, C·vec(M(z)) − R ≥ 0.
 
         A plane states that its contact keeps the margin; M are the placements of all joints. Unused
-        slots have C = 0, R = −1.
+        slots have C = 0, R = −1. With the witness point a at a' in the frame (R_i, t_i) of joint i,
+        b at b' in that of joint j, and the margin m,
+
+            n·(R_j b' + t_j) − n·(R_i a' + t_i) − m ≥ 0
+
+        so that C has b'_k n for column k of R_j and n for t_j, and the negative of both for i. A
+        point that is fixed in the world is part of R.
 
         Args:
             z: Configurations, shape (W, n).
@@ -282,23 +312,28 @@ class ContactModel:
             C, shape (W, slots, 12·joints), and R, shape (W, slots).
         """
         joints = self.chain.model.njoints - 1
-        # for each joint the columns of R, then t
+        # for each joint the columns of its rotation, then its translation
         coefficients = np.zeros((len(z), slots, joints, 4, 3))
         offsets = np.full((len(z), slots), -1.0)
-        place = contacts.slot
-        keep = np.flatnonzero(place < slots)
-        row, slot, normal = contacts.waypoint[keep], place[keep], contacts.normal[keep]
-        offset = contacts.margin[keep].copy()
+        rank = contacts.slot
+        kept = np.flatnonzero(rank < slots)
+        row = contacts.waypoint[kept]
+        slot = rank[kept]
+        normal = contacts.normal[kept]
+        offset = contacts.margin[kept].copy()
         rotations, translations = self.chain.joint_placements(z)
-        for column, points, sign in ((0, contacts.first, -1.0), (1, contacts.second, 1.0)):
-            points = points[keep]
-            joint = self._joints[contacts.pair[keep, column]]
+        for column, witnesses, sign in ((0, contacts.first, -1.0), (1, contacts.second, 1.0)):
+            points = witnesses[kept]
+            joint = self._joints[contacts.pair[kept, column]]
             is_static = joint == 0
             offset[is_static] -= sign * np.einsum("ci,ci->c", normal[is_static], points[is_static])
-            r, s, j, n = row[~is_static], slot[~is_static], joint[~is_static], normal[~is_static]
-            local = np.einsum(
-                "cij,ci->cj", rotations[r, j], points[~is_static] - translations[r, j]
-            )
+            moves = ~is_static
+            r = row[moves]
+            s = slot[moves]
+            j = joint[moves]
+            n = normal[moves]
+            # R_jᵀ (b − t_j)
+            local = np.einsum("cij,ci->cj", rotations[r, j], points[moves] - translations[r, j])
             coefficients[r, s, j - 1, :3] += sign * local[:, :, None] * n[:, None, :]
             coefficients[r, s, j - 1, 3] += sign * n
         offsets[row, slot] = offset

@@ -26,21 +26,22 @@ class PoseSolver:
 
     def __init__(self, model: pin.Model, pose: PoseRow, cache: Cache | None = None) -> None:
         self.size = model.nv
-        z, target = ca.SX.sym("z", self.size), ca.SX.sym("W", 12)
+        z = ca.SX.sym("z", self.size)
+        target = ca.SX.sym("W", 12)
         placements = get_kinematics(model, cache or Cache()).build_placements(z)
-        residual = ca.densify(
-            build_pose_residual(pose.kind, *pose.build_placement(placements), target)
-        )
+        rotation, translation = pose.build_placement(placements)
+        residual = ca.densify(build_pose_residual(pose.kind, rotation, translation, target))
         self.rows = int(residual.numel())
         jacobian = ca.densify(ca.jacobian(residual, z))
         self._function = BatchFunction(ca.Function("pose", [z, target], [residual, jacobian]))
-        lower, upper, weights = (
-            ca.SX.sym(name, self.size) for name in ("lower", "upper", "weights")
-        )
+        lower = ca.SX.sym("lower", self.size)
+        upper = ca.SX.sym("upper", self.size)
+        weights = ca.SX.sym("weights", self.size)
         step = _build_step(z, residual, jacobian, weights, (lower, upper))
-        moved = [ca.mmax(ca.fabs(residual)), ca.fmin(ca.fmax(z + step, lower), upper)]
+        error = ca.mmax(ca.fabs(residual))
+        moved = ca.fmin(ca.fmax(z + step, lower), upper)
         self._step_function = BatchFunction(
-            ca.Function("moved", [z, target, lower, upper, weights], moved)
+            ca.Function("moved", [z, target, lower, upper, weights], [error, moved])
         )
 
     @property
@@ -59,7 +60,8 @@ class PoseSolver:
             Residuals, shape (B, m), [m] and [rad], and Jacobians, shape (B, m, n).
         """
         residual, jacobian = self._function(z, flatten_target(target))
-        return residual, jacobian.reshape(len(z), self.size, self.rows).swapaxes(1, 2)
+        columns = jacobian.reshape(len(z), self.size, self.rows)
+        return residual, columns.swapaxes(1, 2)
 
     def solve(
         self,
@@ -86,10 +88,14 @@ class PoseSolver:
         Returns:
             Configurations, shape (B, n), and a mask of those that satisfy the pose, shape (B,).
         """
-        z, goal = np.clip(z, lower, upper), flatten_target(target)
-        lower, upper = np.broadcast_to(lower, z.shape), np.broadcast_to(upper, z.shape)
+        z = np.clip(z, lower, upper)
+        goal = flatten_target(target)
         errors = np.empty(len(z))
-        unsolved, rows = np.arange(len(z)), z  # unsolved configurations and their limits
+        # Indices of unsolved configurations; their values and limits.
+        unsolved = np.arange(len(z))
+        rows = z
+        lower = np.broadcast_to(lower, z.shape)
+        upper = np.broadcast_to(upper, z.shape)
         for remaining in range(iterations, -1, -1):
             record_evaluations(len(rows))
             error, moved = self._step_function(rows, goal, lower, upper, weights)
@@ -102,7 +108,8 @@ class PoseSolver:
                 upper = upper[is_unsolved]
             if not len(unsolved) or not remaining:
                 break
-            z[unsolved] = rows = moved
+            rows = moved
+            z[unsolved] = rows
         return z, errors < tolerance
 
 
@@ -111,18 +118,25 @@ def _build_step(
 ) -> ca.SX:
     """Return the damped Gauss-Newton step, shape (n,).
 
-    Coordinates that the step would move beyond their limits are fixed, and the step is solved once
-    more without them.
+    With the residual r, its Jacobian J, the damping λ and the costs W = diag(weights), the minimum
+    of |r + J δ|² + λ δᵀWδ is
+
+        δ = −W⁻¹Jᵀ (J W⁻¹Jᵀ + λI)⁻¹ r
+
+    The damping shrinks with the residual, so that convergence is fast at the end. Coordinates that
+    the step would move beyond their limits are fixed, and the step is solved once more without
+    them.
     """
     lower, upper = limits
     free = upper - lower > 1e-9
     damping = 1e-8 + 1e-3 * ca.fmin(1.0, ca.sumsqr(residual))
     step = ca.SX.zeros(z.numel())
     for _ in range(2):
-        scaled = jacobian @ ca.diag(free / weights)
+        scaled = jacobian @ ca.diag(free / weights)  # J W⁻¹, zero for fixed coordinates
         system = scaled @ jacobian.T + damping * ca.SX.eye(residual.numel())
         step = -scaled.T @ ca.ldl_solve(residual, *ca.ldl(system))
-        step *= ca.fmin(1.0, MAX_STEP / ca.fmax(ca.mmax(ca.fabs(step)), 1e-12))
-        blocked = ca.logic_or(z + step < lower - 1e-12, z + step > upper + 1e-12)
-        free = ca.logic_and(free, ca.logic_not(blocked))
+        largest = ca.mmax(ca.fabs(step))
+        step *= ca.fmin(1.0, MAX_STEP / ca.fmax(largest, 1e-12))
+        is_blocked = ca.logic_or(z + step < lower - 1e-12, z + step > upper + 1e-12)
+        free = ca.logic_and(free, ca.logic_not(is_blocked))
     return step

@@ -60,7 +60,8 @@ class PoseRow:
         translation = rotation @ self.local.translation + column[9:]
         if self.shift is not None:
             joint, vector = self.shift
-            translation = translation + ca.reshape(placements[:9, joint - 1], 3, 3) @ ca.DM(vector)
+            shift_rotation = ca.reshape(placements[:9, joint - 1], 3, 3)
+            translation = translation + shift_rotation @ ca.DM(vector)
         return rotation @ self.local.rotation, translation
 
     def compute_placements(self, rotations: Floats, translations: Floats) -> tuple[Floats, Floats]:
@@ -90,27 +91,58 @@ def build_pose_residual(kind: str, rotation: Any, translation: Any, target: Any)
     offset = translation - target[9:]
     if kind == "point":
         return offset
-    if kind in _VERTICAL:
-        tilt_components, along = _compute_tilt(rotation, target)
-        squared = 2.0 + 2.0 * along  # (2 cos(θ/2))²
-        upside_down = ca.DM([2.0, 0.0])
-        tilt = ca.if_else(
-            squared > _MIN_SQUARED_COSINE,
-            2.0 * tilt_components / ca.sqrt(ca.fmax(squared, _MIN_SQUARED_COSINE)),
-            upside_down + tilt_components,
-        )
-        return ca.vertcat(offset, tilt) if kind == "upright" else tilt
-    error = ca.reshape(target[:9], 3, 3).T @ rotation
-    vee = ca.vertcat(
+    if kind == "upright":
+        return ca.vertcat(offset, _build_tilt_residual(rotation, target))
+    if kind == "level":
+        return _build_tilt_residual(rotation, target)
+    return ca.vertcat(offset, _build_rotation_residual(rotation, target))
+
+
+def _build_tilt_residual(rotation: Any, target: Any) -> Any:
+    """Return 2 sin(θ/2)·(u_x, u_y)/sin θ for the angle θ between the verticals, shape (2, 1).
+
+    With the vertical u of the world, of which u_x and u_y are across the target's and u_z = cos θ
+    is along it, this is 2 (u_x, u_y) / (2 cos(θ/2)), where (2 cos(θ/2))² = 2 + 2 cos θ. Near
+    θ = π, where the direction is ambiguous, it is 2 in any direction, with the gradient of u.
+    """
+    across, along = _compute_tilt(rotation, target)
+    squared_cosine = 2.0 + 2.0 * along  # (2 cos(θ/2))²
+    double_cosine = ca.sqrt(ca.fmax(squared_cosine, _MIN_SQUARED_COSINE))
+    upside_down = ca.DM([2.0, 0.0])
+    return ca.if_else(
+        squared_cosine > _MIN_SQUARED_COSINE,
+        2.0 * across / double_cosine,
+        upside_down + across,
+    )
+
+
+def _build_rotation_residual(rotation: Any, target: Any) -> Any:
+    """Return 2 sin(θ/2)·a for angle θ and axis a of E = R*ᵀR, shape (3, 1).
+
+    vee(E − Eᵀ) is 2 sin θ·a = 4 sin(θ/2) cos(θ/2)·a, and the trace of E is 1 + 2 cos θ, so that
+    (2 cos(θ/2))² = 1 + trace E. Near θ = π, where E + I = 2aaᵀ, the residual is twice the unit
+    vector along (E + I) g = 2(a·g)a for some g; adding vee leads away from π.
+    """
+    error = _compute_rotation_error(rotation, target)
+    vee = _build_vee(error)
+    squared_cosine = 1.0 + error[0, 0] + error[1, 1] + error[2, 2]  # (2 cos(θ/2))²
+    double_cosine = ca.sqrt(ca.fmax(squared_cosine, _MIN_SQUARED_COSINE))
+    along_axis = error @ _GENERIC_VECTOR + _GENERIC_VECTOR
+    size = ca.sqrt(ca.fmax(ca.sumsqr(along_axis), _MIN_SQUARED_COSINE))
+    half_turn = 2.0 * along_axis / size + vee
+    return ca.if_else(squared_cosine > _MIN_SQUARED_COSINE, vee / double_cosine, half_turn)
+
+
+def _compute_rotation_error(rotation: Any, target: Any) -> Any:
+    """Return E = R*ᵀR, shape (3, 3)."""
+    return ca.reshape(target[:9], 3, 3).T @ rotation
+
+
+def _build_vee(error: Any) -> Any:
+    """Return vee(E − Eᵀ) = 2 sin(θ)·a of a rotation by θ about a, shape (3, 1)."""
+    return ca.vertcat(
         error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1]
     )
-    squared = 1.0 + error[0, 0] + error[1, 1] + error[2, 2]  # (2 cos(θ/2))²
-    flipped = error @ _GENERIC_VECTOR + _GENERIC_VECTOR  # 2(a·g)a
-    flipped = 2.0 * flipped / ca.sqrt(ca.fmax(ca.sumsqr(flipped), _MIN_SQUARED_COSINE)) + vee
-    angle = ca.if_else(
-        squared > _MIN_SQUARED_COSINE, vee / ca.sqrt(ca.fmax(squared, _MIN_SQUARED_COSINE)), flipped
-    )
-    return ca.vertcat(offset, angle)
 
 
 def build_pose_rows(kind: str, rotation: Any, translation: Any, target: Any) -> Any:
@@ -125,15 +157,14 @@ def build_pose_rows(kind: str, rotation: Any, translation: Any, target: Any) -> 
     if kind == "point":
         return offset
     if kind in _VERTICAL:
-        return ca.vertcat(
-            *([offset] if kind == "upright" else []), *_compute_tilt(rotation, target)
-        )
-    error = ca.reshape(target[:9], 3, 3).T @ rotation
-    vee = (
-        ca.vertcat(error[2, 1] - error[1, 2], error[0, 2] - error[2, 0], error[1, 0] - error[0, 1])
-        / 2
-    )
-    return ca.vertcat(offset, vee, error[0, 0] + error[1, 1] + error[2, 2])
+        across, along = _compute_tilt(rotation, target)
+        if kind == "upright":
+            return ca.vertcat(offset, across, along)
+        return ca.vertcat(across, along)
+    error = _compute_rotation_error(rotation, target)
+    vee = _build_vee(error) / 2
+    trace = error[0, 0] + error[1, 1] + error[2, 2]
+    return ca.vertcat(offset, vee, trace)
 
 
 # Size of a pose offset: translation [m], rotation axis and rotation angle [rad].
@@ -157,49 +188,60 @@ def compute_pose_offsets(
     # Axis times sine, and cosine, of the angle θ, or of θ/2 for a pose.
     axis_sine = np.zeros((len(rotations), 3))
     cosine = np.ones(len(rotations))
-    if (
-        kind in _VERTICAL
-        # θ is the tilt of the vertical in the world; an upside-down frame tilts about any level
-        # axis
-    ):
+    if kind in _VERTICAL:
+        # With u = R*Rᵀe_z the frame is tilted by θ about (u_y, −u_x, 0) in the world; if it is
+        # upside down, about any level axis.
         vertical = rotations[:, 2] @ target.rotation.T
         axis_sine = np.column_stack([vertical[:, 1], -vertical[:, 0], np.zeros(len(axis_sine))])
-        axis_sine = (
-            np.where(axis_sine.any(axis=1, keepdims=True), axis_sine, [1e-99, 0.0, 0.0])
-            @ target.rotation
-        )
+        has_axis = axis_sine.any(axis=1, keepdims=True)
+        axis_sine = np.where(has_axis, axis_sine, [1e-99, 0.0, 0.0]) @ target.rotation
         cosine = vertical[:, 2]
     elif kind == "pose":
-        # eigenpy never frees its copies of row-major matrices.
-        errors = map(np.asfortranarray, target.rotation.T @ rotations)
-        quaternions = np.array([pin.Quaternion(error).coeffs() for error in errors]).reshape(-1, 4)
+        # A unit quaternion is (sin(θ/2) a, cos(θ/2)), and its negative the same rotation: take the
+        # one with θ ≤ π.
+        errors = target.rotation.T @ rotations
+        quaternions = np.zeros((len(errors), 4))
+        for quaternion, error in zip(quaternions, errors, strict=True):
+            # eigenpy never frees its copies of row-major matrices.
+            quaternion[:] = pin.Quaternion(np.asfortranarray(error)).coeffs()
         axis_sine = quaternions[:, :3] * np.where(quaternions[:, 3:] < 0.0, -1.0, 1.0)
         cosine = np.abs(quaternions[:, 3])
-    size = np.linalg.norm(axis_sine, axis=1, keepdims=True)
-    axis = np.where(size > 0.0, axis_sine / np.maximum(size, np.finfo(float).tiny), [0.0, 0.0, 1.0])
-    angle = (2.0 if kind == "pose" else 1.0) * np.arctan2(size[:, 0], cosine)
-    return np.column_stack([(kind != "level") * (translations - target.translation), axis, angle])
+    sine = np.linalg.norm(axis_sine, axis=1, keepdims=True)
+    axis = np.where(sine > 0.0, axis_sine / np.maximum(sine, np.finfo(float).tiny), [0.0, 0.0, 1.0])
+    angle = np.arctan2(sine[:, 0], cosine)
+    if kind == "pose":
+        angle = 2.0 * angle
+    offsets = translations - target.translation
+    if kind == "level":
+        offsets = 0.0 * offsets
+    return np.column_stack([offsets, axis, angle])
 
 
 def relax_target(target: Any, pose_offset: Any, relaxation: Any) -> Any:
     """Return a target moved towards a frame: R*·exp(e·θ·a) and p* + e·(p − p*), shape (12, 1).
 
     With relaxation e = 1 it is where the frame was at `compute_pose_offsets`, with e = 0 the
-    target.
+    target. By Rodrigues' formula, with the matrix K of the cross product with a,
+
+        exp(e·θ·a) = I + sin(e·θ) K + (1 − cos(e·θ)) K²
     """
-    skew = ca.skew(pose_offset[3:6])
+    offset = pose_offset[:3]
+    cross = ca.skew(pose_offset[3:6])
+    angle = pose_offset[6]
     turn = (
         ca.DM.eye(3)
-        + ca.sin(relaxation * pose_offset[6]) * skew
-        + (1.0 - ca.cos(relaxation * pose_offset[6])) * (skew @ skew)
+        + ca.sin(relaxation * angle) * cross
+        + (1.0 - ca.cos(relaxation * angle)) * (cross @ cross)
     )
-    return ca.vertcat(
-        ca.vec(ca.reshape(target[:9], 3, 3) @ turn), target[9:] + relaxation * pose_offset[:3]
-    )
+    rotation = ca.reshape(target[:9], 3, 3) @ turn
+    return ca.vertcat(ca.vec(rotation), target[9:] + relaxation * offset)
 
 
 def _compute_tilt(rotation: Any, target: Any) -> tuple[Any, Any]:
-    """Return the components of the vertical across and along the target's, in the frame."""
+    """Return the components of u = R*Rᵀe_z across (x, y) and along (z) the vertical.
+
+    It is the world's vertical as seen from the frame, turned by the target.
+    """
     vertical = ca.reshape(target[:9], 3, 3) @ rotation[2, :].T
     return vertical[:2], vertical[2]
 

@@ -14,7 +14,10 @@ class CubicPath:
     """A cubic Hermite spline of n coordinates, extrapolated by its outermost cubics.
 
     It equals `scipy.interpolate.CubicHermiteSpline` bit for bit. Importing that takes longer than
-    planning a motion.
+    planning a motion. At distance s behind a knot with value y₀, in an interval of width h and
+    chord c with the slopes d₀ and d₁ at its ends,
+
+        y(s) = y₀ + d₀ s + ((c − d₀)/h − b) s² + (b/h) s³,   b = (d₀ + d₁ − 2c)/h
 
     Args:
         x: Increasing positions of the knots, shape (K,), K ≥ 2.
@@ -27,13 +30,11 @@ class CubicPath:
         widths = np.diff(self.x)[:, None]
         chords = np.diff(y, axis=0) / widths
         bends = (dydx[:-1] + dydx[1:] - 2.0 * chords) / widths
-        # Of 1, s, s² and s³, with the distance s from the knot before.
-        self._coefficients = (
-            np.asarray(y[:-1], float),
-            np.asarray(dydx[:-1], float),
-            (chords - dydx[:-1]) / widths - bends,
-            bends / widths,
-        )
+        constant = np.asarray(y[:-1], float)
+        linear = np.asarray(dydx[:-1], float)
+        quadratic = (chords - dydx[:-1]) / widths - bends
+        cubic = bends / widths
+        self._coefficients = (constant, linear, quadratic, cubic)
 
     def __call__(self, positions: ArrayLike, order: int = 0) -> Floats:
         """Return a derivative, shape (..., n), at path positions, shape (...,), right of knots.
@@ -43,25 +44,32 @@ class CubicPath:
             order: Order of the derivative, 0 to 3.
         """
         at = np.asarray(positions, float)
-        cubic = np.searchsorted(self.x[1:-1], at, side="right")
-        distance = (at - self.x[cubic])[..., None]
-        found = np.zeros((*at.shape, self._coefficients[0].shape[1]))
+        interval = np.searchsorted(self.x[1:-1], at, side="right")
+        distance = (at - self.x[interval])[..., None]
+        coordinate_count = self._coefficients[0].shape[1]
+        derivative = np.zeros((*at.shape, coordinate_count))
+        # The derivative of s^k of order r is k!/(k − r)! s^(k − r).
         power = np.ones_like(distance)
         for exponent in range(order, 4):
-            found += self._coefficients[exponent][cubic] * power * perm(exponent, order)
+            coefficient = self._coefficients[exponent][interval]
+            derivative += coefficient * power * perm(exponent, order)
             power = power * distance
-        return found
+        return derivative
 
 
 def compute_natural_slopes(x: Floats, y: Floats) -> Floats:
     """Return the slopes at knots of the cubic spline that is twice differentiable.
 
-    Its second derivative d is zero at both ends. With h_k = x_{k+1} - x_k, continuity of the second
+    Its second derivative is zero at both ends. With h_k = x_{k+1} - x_k, continuity of the second
     derivative at knot k is
 
         h_k d_{k-1} + 2 (h_{k-1} + h_k) d_k + h_{k-1} d_{k+1} = 3 (h_k c_{k-1} + h_{k-1} c_k)
 
-    in the slopes d and the chords c, a tridiagonal system with a dominant diagonal: it is solved by
+    in the slopes d and the chords c. No second derivative at the ends means
+
+        2 h_0 d_0 + h_0 d_1 = 3 h_0 c_0
+
+    and its mirror image. The diagonal of this tridiagonal system is dominant: it is solved by
     elimination without pivoting.
 
     Args:
@@ -72,16 +80,20 @@ def compute_natural_slopes(x: Floats, y: Floats) -> Floats:
     chords = np.diff(y, axis=0) / widths[:, None]
     lower = [*widths[1:], widths[-1]]
     upper = [widths[0], *widths[:-1]]
-    diagonal = [2.0 * widths[0], *(2.0 * (widths[:-1] + widths[1:])), 2.0 * widths[-1]]
-    right = np.empty_like(y)
-    right[0] = 3.0 * (y[1] - y[0])
-    right[1:-1] = 3.0 * (widths[1:, None] * chords[:-1] + widths[:-1, None] * chords[1:])
-    right[-1] = 3.0 * (y[-1] - y[-2])
+    inner_diagonal = 2.0 * (widths[:-1] + widths[1:])
+    diagonal = [2.0 * widths[0], *inner_diagonal, 2.0 * widths[-1]]
+    right_side = np.empty_like(y)
+    right_side[0] = 3.0 * (y[1] - y[0])
+    right_side[1:-1] = 3.0 * (widths[1:, None] * chords[:-1] + widths[:-1, None] * chords[1:])
+    right_side[-1] = 3.0 * (y[-1] - y[-2])
+    # Eliminate the lower diagonal.
     for k in range(len(x) - 1):
         factor = lower[k] / diagonal[k]
         diagonal[k + 1] -= factor * upper[k]
-        right[k + 1] -= factor * right[k]
-    right[-1] /= diagonal[-1]
+        right_side[k + 1] -= factor * right_side[k]
+    # Substitute back, in place.
+    slopes = right_side
+    slopes[-1] /= diagonal[-1]
     for k in range(len(x) - 2, -1, -1):
-        right[k] = (right[k] - upper[k] * right[k + 1]) / diagonal[k]
-    return right
+        slopes[k] = (slopes[k] - upper[k] * slopes[k + 1]) / diagonal[k]
+    return slopes

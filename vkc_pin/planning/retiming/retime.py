@@ -26,15 +26,17 @@ from vkc_pin.world.trajectory.wheels import RollingLimits, make_rolling_limits
 _MIN_PIECES = 3  # minimum pieces per step; the path velocity is linear in time in each
 _MIN_JOINT_STEP = 1e-6  # [m] or [rad], smaller steps of an object's joint count as none
 _MIN_STEP_DURATION = 1e-6  # [s] at full speed; shorter steps count as none
-# With jerk limits the motion stops between a step whose time at full speed is below this share of
-# `jerk_time`, and one that is longer by this factor: a turn on a short path would slow down all.
-_SHORT_STEP, _ABRUPT_RATIO = 0.1, 30.0
+# With jerk limits the motion stops between a step whose time at full speed is below this fraction
+# of `jerk_time`, and one that is longer by this factor: a turn on a short path would slow down all.
+_SHORT_STEP = 0.1
+_ABRUPT_RATIO = 30.0
 _WAIT_DURATION = 1e-3  # [s], duration of a step without motion, unless a hand opens or closes in it
 _ROUNDING = 1e-9  # relative
 # jump in acceleration that is allowed with jerk limits, relative to the acceleration limit
 _JUMP_RATIO = 1e-4
 # search for speeds within torque limits: iterations, and relative change at convergence
-_TORQUE_ITERATIONS, _TORQUE_TOLERANCE = 4, 0.02
+_TORQUE_ITERATIONS = 4
+_TORQUE_TOLERANCE = 0.02
 # [m/s], lateral velocity of a wheeled base that needs no more knots, a fifth of what counts as slip
 _MAX_SLIP = 2e-4
 _MAX_REFINEMENT = 8  # of the knots
@@ -42,7 +44,7 @@ _MAX_REFINEMENT = 8  # of the knots
 
 Close = Callable[[Floats, Floats], Floats]
 """Moves points between waypoints onto the closure manifold: points, shape (M, n), and the waypoint
-of each with the fraction of the way to the next, shape (M,) → points, shape (M, n)."""
+of each plus the fraction of the step to the next, shape (M,) → points, shape (M, n)."""
 
 
 def retime_trajectory(
@@ -73,64 +75,92 @@ def retime_trajectory(
         close: Closes chains where lines are parted, which straight lines of the coordinates open.
     """
     limits = Limits.from_scene(scene, trajectory.names, jerk_time)
-    parts = np.ones(len(trajectory.times) - 1, int) if parts is None else parts
+    if parts is None:
+        parts = np.ones(len(trajectory.times) - 1, int)
     rolling = make_rolling_limits(scene.robot)
-    places = np.concatenate([[0], np.cumsum(parts)])  # indices of the waypoints among all points
-    positions = _subdivide(trajectory.positions, places, rolling, close)
+    waypoints = np.concatenate([[0], np.cumsum(parts)])  # indices of the waypoints among all points
+    positions = _subdivide(trajectory.positions, waypoints, rolling, close)
+    # The length of a step is its time [s] at full speed.
     scale = 1.0 / np.where(np.isfinite(limits.velocity), limits.velocity, 1.0)
     lengths = np.linalg.norm(np.diff(positions, axis=0) * scale, axis=1)
     is_still = lengths <= _MIN_STEP_DURATION
-    short, long = np.sort([lengths[:-1], lengths[1:]], axis=0)
-    is_abrupt = short < np.minimum(_SHORT_STEP * jerk_time, long / _ABRUPT_RATIO)
-    wait_durations = {
-        int(places[phase.first]): float(np.diff(trajectory.times)[phase.first])
-        for phase in trajectory.phases
-    }
-    pieces, ends, torques = list[Curve](), [0], Torques(scene, trajectory)
-    moving_joints = np.abs(np.diff(positions[:, trajectory.robot_size :], axis=0)) > _MIN_JOINT_STEP
-    phases = torques.phases_of(np.searchsorted(places, np.arange(places[-1]), side="right") - 1)
-    for steps in _split_into_runs(is_still, moving_joints, is_abrupt):
-        points = positions[steps[0] : steps[-1] + 2]
-        if is_still[steps[0]]:
-            least = np.array([wait_durations.get(step, _WAIT_DURATION) for step in steps])
-            curves = [(_make_straight_curve(points, limits, least), np.arange(1, len(points)))]
+    is_stop = _find_stops(positions[:, trajectory.robot_size :], lengths, is_still, jerk_time)
+
+    wait_durations = {}
+    for phase in trajectory.phases:
+        first_step = int(waypoints[phase.first])
+        wait_durations[first_step] = float(np.diff(trajectory.times)[phase.first])
+    torques = Torques(scene, trajectory)
+    waypoint_before = np.searchsorted(waypoints, np.arange(waypoints[-1]), side="right") - 1
+    phases = torques.phases_of(waypoint_before)
+
+    pieces = list[Curve]()
+    point_knots = [0]  # indices of all points among the knots of the curve
+    for first, last in _split_into_runs(is_stop):
+        points = positions[first : last + 1]
+        if is_still[first]:
+            least = [wait_durations.get(step, _WAIT_DURATION) for step in range(first, last)]
+            straight = _make_straight_curve(points, limits, np.array(least))
+            curves = [(straight, np.arange(1, len(points)))]
         else:
-            is_known = torques.torque_limits.is_known
-            torque_bounds = TorqueBounds(torques, phases[steps]) if is_known else None
+            torque_bounds = None
+            if torques.torque_limits.is_known:
+                torque_bounds = TorqueBounds(torques, phases[first:last])
             curves = _follow_waypoints(points, limits, scale, rolling, torque_bounds)
-        for piece, at in curves:
-            ends += (ends[-1] + at).tolist()
+        for piece, knots in curves:
+            point_knots += (point_knots[-1] + knots).tolist()
             pieces.append(piece)
     curve = concatenate_curves(pieces).shift_time(float(trajectory.times[0]))
-    return replace(trajectory, times=curve.times[np.array(ends)[places]], curve=curve)
+    waypoint_knots = np.array(point_knots)[waypoints]
+    return replace(trajectory, times=curve.times[waypoint_knots], curve=curve)
 
 
 def _subdivide(
-    positions: Floats, places: Ints, rolling: RollingLimits, close: Close | None
+    positions: Floats, waypoints: Ints, rolling: RollingLimits, close: Close | None
 ) -> Floats:
-    """Return waypoints, (T, n), and points on the lines (wheeled bases: arcs) between them."""
-    every = np.arange(places[-1] + 1)
-    at = np.interp(every, places, np.arange(len(places)))
-    points = np.stack([np.interp(every, places, column) for column in positions.T], axis=-1)
+    """Return waypoints, (T, n), and points on the lines (wheeled bases: arcs) between them.
+
+    `waypoints` are the indices of the waypoints among all points, shape (T,).
+    """
+    every = np.arange(waypoints[-1] + 1)
+    at = np.interp(every, waypoints, np.arange(len(waypoints)))  # waypoint plus fraction of step
+    columns = [np.interp(every, waypoints, column) for column in positions.T]
+    points = np.stack(columns, axis=-1)
     if len(points) == len(positions):
         return points
     if not rolling.is_omnidirectional:
         step = np.minimum(at.astype(int), len(positions) - 2)
         points[:, :3] = interpolate_arcs(positions[step, :3], positions[step + 1, :3], at - step)
     if close is not None:
-        inserted = np.setdiff1d(every, places)
+        inserted = np.setdiff1d(every, waypoints)
         points[inserted] = close(points[inserted], at[inserted])
     return points
 
 
-def _split_into_runs(
-    is_still: Bools, moving_joints: Bools, is_abrupt: Bools
-) -> Iterator[list[int]]:
-    """Yield the steps of each run between stops, see `retime_trajectory`."""
-    stops = (moving_joints[1:] != moving_joints[:-1]).any(axis=1) | (is_still[1:] != is_still[:-1])
-    stops |= is_abrupt
-    edges = [0, *(np.flatnonzero(stops) + 1).tolist(), len(is_still)]
-    yield from (list(range(first, last)) for first, last in itertools.pairwise(edges))
+def _find_stops(
+    object_positions: Floats, lengths: Floats, is_still: Bools, jerk_time: float
+) -> Bools:
+    """Return a mask of inner points at which the motion stops, see `retime_trajectory`.
+
+    Args:
+        object_positions: Coordinates of objects at all points, shape (M, k).
+        lengths: Time of each step at full speed, shape (M − 1,) [s].
+        is_still: Mask of steps without motion, shape (M − 1,).
+        jerk_time: See `Options.jerk_time`.
+    """
+    is_moving = np.abs(np.diff(object_positions, axis=0)) > _MIN_JOINT_STEP
+    joints_start_or_cease = (is_moving[1:] != is_moving[:-1]).any(axis=1)
+    rest_begins_or_ends = is_still[1:] != is_still[:-1]
+    shorter, longer = np.sort([lengths[:-1], lengths[1:]], axis=0)
+    is_abrupt = shorter < np.minimum(_SHORT_STEP * jerk_time, longer / _ABRUPT_RATIO)
+    is_stop: Bools = joints_start_or_cease | rest_begins_or_ends | is_abrupt
+    return is_stop
+
+
+def _split_into_runs(is_stop: Bools) -> Iterator[tuple[int, int]]:
+    """Yield the first and last point of each run between stops, a mask of inner points."""
+    inner_stops = (np.flatnonzero(is_stop) + 1).tolist()
+    yield from itertools.pairwise([0, *inner_stops, len(is_stop) + 1])
 
 
 def _follow_waypoints(
@@ -141,25 +171,26 @@ def _follow_waypoints(
     torque_bounds: TorqueBounds | None,
 ) -> list[tuple[Curve, Ints]]:
     """Return curves through waypoints, shape (m, n), from stop to stop."""
-    bounds = limits.lower, limits.upper
     if not rolling.is_omnidirectional:
-        return list(
-            _follow_rolling_paths(
-                points, limits.with_wheels(rolling), scale, rolling, torque_bounds
-            )
-        )
-    result = _retime_path(fit_path(points, scale, bounds), points, limits, torque_bounds)
+        wheeled_limits = limits.with_wheels(rolling)
+        curves = _follow_rolling_paths(points, wheeled_limits, scale, rolling, torque_bounds)
+        return list(curves)
+    bounds = (limits.lower, limits.upper)
+    path = fit_path(points, scale, bounds)
+    result = _retime_path(path, points, limits, torque_bounds)
     if result is not None:
         return [result]
-    if not limits.has_unlimited_jerk:
-        steps = map(np.array, itertools.pairwise(points))
-        return [
-            _follow_step(fit_path(step, scale, bounds), step, limits, torque_bounds, k)
-            for k, step in enumerate(steps)
-        ]
-    straight = _make_straight_curve(points, limits, np.zeros(len(points) - 1))
-    straight = straight if torque_bounds is None else torque_bounds.slow_down(straight)
-    return [(straight, np.arange(1, len(points)))]
+    if limits.has_unlimited_jerk:
+        straight = _make_straight_curve(points, limits, np.zeros(len(points) - 1))
+        if torque_bounds is not None:
+            straight = torque_bounds.slow_down(straight)
+        return [(straight, np.arange(1, len(points)))]
+    steps = []
+    for k in range(len(points) - 1):
+        ends = points[k : k + 2]
+        path = fit_path(ends, scale, bounds)
+        steps.append(_follow_step(path, ends, limits, torque_bounds, k))
+    return steps
 
 
 def _follow_rolling_paths(
@@ -174,19 +205,20 @@ def _follow_rolling_paths(
 
     The number of knots is multiplied by `refinement`, and increased where the base would slip.
     """
-    bounds, begin = (limits.lower[:-2], limits.upper[:-2]), 0
+    bounds = (limits.lower[:-2], limits.upper[:-2])  # without those of the wheels
+    first_step = 0
     for path, waypoints in fit_rolling_paths(points, scale, bounds, rolling, refinement):
-        bounds_of_path = (
-            None if torque_bounds is None else torque_bounds.select_steps(begin, len(waypoints) - 1)
-        )
-        begin += len(waypoints) - 1
+        steps = len(waypoints) - 1
+        bounds_of_path = None
+        if torque_bounds is not None:
+            bounds_of_path = torque_bounds.select_steps(first_step, steps)
+        first_step += steps
         result = _retime_path(path, waypoints, limits, bounds_of_path)
         if result is None:
-            for k in range(len(waypoints) - 1):
-                ((path, step),) = fit_rolling_paths(
-                    waypoints[k : k + 2], scale, bounds, rolling, _MAX_REFINEMENT
-                )
-                yield _follow_step(path, step, limits, bounds_of_path, k)
+            for k in range(steps):
+                ends = waypoints[k : k + 2]
+                ((step, _),) = fit_rolling_paths(ends, scale, bounds, rolling, _MAX_REFINEMENT)
+                yield _follow_step(step, ends, limits, bounds_of_path, k)
         elif refinement < _MAX_REFINEMENT and compute_slip(result[0]) > _MAX_SLIP:
             yield from _follow_rolling_paths(
                 waypoints, limits, scale, rolling, bounds_of_path, 2 * refinement
@@ -202,26 +234,29 @@ def _retime_path(
 
     Torques are checked only for the fastest curve within the other limits, since few exceed them.
     """
-    knots = (len(path.x) - 1) // (len(points) - 1)  # a step
-    parts = knots * max(_MIN_PIECES // knots, 1)
-    places = sample_intervals(path.x, np.arange(parts // knots) / (parts // knots), last=True)
+    cubics_per_step = (len(path.x) - 1) // (len(points) - 1)
+    pieces_per_cubic = max(_MIN_PIECES // cubics_per_step, 1)
+    fractions = np.arange(pieces_per_cubic) / pieces_per_cubic
+    places = sample_intervals(path.x, fractions, last=True)
     speeds = compute_speeds(path, places, limits.velocity, limits.acceleration)
     if speeds is None:
         return None
     curve, waypoints = _follow_at_speeds(path, places, points, speeds, limits)
-    if (
-        torque_bounds is None
-        or np.abs(torque_bounds.evaluate(curve)).max() <= 1.0
-        or np.abs(torque_bounds.decompose(curve)[0]).max() >= 1.0
-    ):
-        return curve, waypoints  # torques are kept, or exceeded even at rest
-    for _ in range(_TORQUE_ITERATIONS):  # viscous torques are linearised around the last speeds
+    if torque_bounds is None or np.abs(torque_bounds.evaluate(curve)).max() <= 1.0:
+        return curve, waypoints
+    static, _, _ = torque_bounds.decompose(curve)
+    if np.abs(static).max() >= 1.0:  # exceeded even at rest
+        return curve, waypoints
+    # Viscous torques are linear in the speed, TOPP-RA takes its square: they are linearised in it
+    # around the last speeds.
+    for _ in range(_TORQUE_ITERATIONS):
         linear = partial(torque_bounds.linearize, path, places, speeds)
         slower = compute_speeds(path, places, limits.velocity, limits.acceleration, linear)
         if slower is None:
             break
-        converged, speeds = np.allclose(slower, speeds, rtol=_TORQUE_TOLERANCE), slower
-        if converged:
+        has_converged = np.allclose(slower, speeds, rtol=_TORQUE_TOLERANCE)
+        speeds = slower
+        if has_converged:
             break
     curve, waypoints = _follow_at_speeds(path, places, points, speeds, limits)
     return torque_bounds.slow_down(curve), waypoints
@@ -230,9 +265,14 @@ def _retime_path(
 def _follow_at_speeds(
     path: CubicPath, places: Floats, points: Floats, speeds: Floats, limits: Limits
 ) -> tuple[Curve, Ints]:
-    """Return the curve along a path at given speeds, and the waypoints' knots."""
-    times = np.concatenate([[0.0], np.cumsum(2.0 * np.diff(places) / (speeds[1:] + speeds[:-1]))])
-    return _follow_at_pace(path, Curve(times, places[:, None], speeds[:, None]), points, limits)
+    """Return the curve along a path at given speeds, and the waypoints' knots.
+
+    The speed is linear in time between two places: each distance is the duration times the mean.
+    """
+    durations = 2.0 * np.diff(places) / (speeds[1:] + speeds[:-1])
+    times = np.concatenate([[0.0], np.cumsum(durations)])
+    pace = Curve(times, places[:, None], speeds[:, None])
+    return _follow_at_pace(path, pace, points, limits)
 
 
 def _follow_at_pace(
@@ -241,13 +281,16 @@ def _follow_at_pace(
     """Return the curve along a path at a pace, or slower, and the knots of the waypoints."""
     if limits.has_unlimited_jerk:
         places = pace.positions[:, 0]
-        curve = limits.slow_down(Curve(pace.times, path(places), path(places, 1) * pace.rates))
+        rates = path(places, 1) * pace.rates
+        curve = limits.slow_down(Curve(pace.times, path(places), rates))
     else:
         curve = limit_jerk(path, pace, len(points) - 1, limits)
-    size, positions = points.shape[1], np.array(curve.positions[:, : points.shape[1]])
-    parts = (len(positions) - 1) // (len(points) - 1)
-    positions[::parts] = points  # bit-exact
-    return Curve(curve.times, positions, curve.rates[:, :size]), np.arange(1, len(points)) * parts
+    size = points.shape[1]  # without the travel of wheels
+    positions = np.array(curve.positions[:, :size])
+    cubics_per_step = (len(positions) - 1) // (len(points) - 1)
+    positions[::cubics_per_step] = points  # bit-exact
+    waypoints = np.arange(1, len(points)) * cubics_per_step
+    return Curve(curve.times, positions, curve.rates[:, :size]), waypoints
 
 
 def _follow_step(
@@ -258,31 +301,32 @@ def _follow_step(
     number: int,
 ) -> tuple[Curve, Ints]:
     """Return the curve of step `number` between waypoints, (2, n), with progress 3s² − 2s³."""
-    length, share = path.x[-1], np.linspace(0.0, 1.0, len(path.x))
-    places = length * (3.0 - 2.0 * share) * share**2
-    speeds = length * 6.0 * (share - share**2) / _WAIT_DURATION
-    pace = Curve(share * _WAIT_DURATION, places[:, None], speeds[:, None])
-    curve, at = _follow_at_pace(path, pace, points, limits)
+    length = path.x[-1]
+    s = np.linspace(0.0, 1.0, len(path.x))
+    places = length * (3.0 - 2.0 * s) * s**2
+    speeds = length * 6.0 * (s - s**2) / _WAIT_DURATION
+    pace = Curve(s * _WAIT_DURATION, places[:, None], speeds[:, None])
+    curve, waypoints = _follow_at_pace(path, pace, points, limits)
     if torque_bounds is not None:
         curve = torque_bounds.select_steps(number, 1).slow_down(curve)
-    return curve, at
+    return curve, waypoints
 
 
 def _make_straight_curve(points: Floats, limits: Limits, least: Floats) -> Curve:
     """Return straight lines through waypoints, shape (m, n), with a stop at each waypoint.
 
-    3s² − 2s³ has a peak velocity of 1.5 and a peak acceleration of 6, which is attained in a jump.
-    With jerk limits the acceleration is therefore almost zero.
+    3s² − 2s³ has a peak velocity of 1.5, a peak acceleration of 6, which is attained in a jump, and
+    a jerk of 12. With jerk limits the acceleration is therefore almost zero. A distance x takes at
+    least the time t with 1.5 x/t, 6 x/t² and 12 x/t³ within the limits. `least` are the durations
+    [s] that the steps have at least, shape (m − 1,).
     """
     distances = np.abs(np.diff(points, axis=0))
-    acceleration = limits.acceleration * (1.0 if limits.has_unlimited_jerk else _JUMP_RATIO)
-    least = np.maximum.reduce(
-        [
-            least,
-            1.5 * (distances / limits.velocity).max(axis=1),
-            np.sqrt(6.0 * (distances / acceleration).max(axis=1)),
-            np.cbrt(12.0 * (distances / limits.jerk).max(axis=1)),
-        ]
-    )
-    times = np.concatenate([[0.0], np.cumsum(np.maximum(least, MIN_INTERVAL) * (1.0 + _ROUNDING))])
+    jump_ratio = 1.0 if limits.has_unlimited_jerk else _JUMP_RATIO
+    acceleration = limits.acceleration * jump_ratio
+    for_velocity = 1.5 * (distances / limits.velocity).max(axis=1)
+    for_acceleration = np.sqrt(6.0 * (distances / acceleration).max(axis=1))
+    for_jerk = np.cbrt(12.0 * (distances / limits.jerk).max(axis=1))
+    durations = np.maximum.reduce([least, for_velocity, for_acceleration, for_jerk])
+    durations = np.maximum(durations, MIN_INTERVAL) * (1.0 + _ROUNDING)
+    times = np.concatenate([[0.0], np.cumsum(durations)])
     return Curve(times, points, np.zeros_like(points))

@@ -23,30 +23,41 @@ def fit_path(points: Floats, scale: Floats, limits: tuple[Floats, Floats]) -> Cu
         scale: Weight of each coordinate in the length, shape (n,).
         limits: Lower and upper limits, shape (n,) each.
     """
-    lengths = np.linalg.norm(np.diff(points, axis=0) * scale, axis=1)
-    arc_lengths = np.concatenate([[0.0], np.cumsum(lengths)])
     steps = np.diff(points, axis=0)
+    lengths = np.linalg.norm(steps * scale, axis=1)
+    arc_lengths = np.concatenate([[0.0], np.cumsum(lengths)])
     chords = steps / lengths[:, None]
-    slopes = (
-        compute_natural_slopes(arc_lengths, points)
-        if len(points) > 2
-        else np.repeat(chords, 2, axis=0)
-    )
-    if not _exceeds_limits(points, slopes, lengths, limits):
+    if len(points) > 2:
+        slopes = compute_natural_slopes(arc_lengths, points)
+    else:
+        slopes = np.repeat(chords, 2, axis=0)
+    if not _exceeds_limits(points, slopes, arc_lengths, limits):
         return CubicPath(arc_lengths, points, slopes)
-    before, after = np.vstack([chords[:1], chords]), np.vstack([chords, chords[-1:]])
-    directions, steepest = np.sign(after), 3.0 * np.minimum(np.abs(before), np.abs(after))
-    monotone = np.where(
-        before * after > 0.0, directions * np.clip(directions * slopes, 0.0, steepest), 0.0
-    )
-    return CubicPath(arc_lengths, points, monotone)
+    return CubicPath(arc_lengths, points, _limit_slopes(slopes, chords))
+
+
+def _limit_slopes(slopes: Floats, chords: Floats) -> Floats:
+    """Return slopes at waypoints, shape (m, n), with which no cubic leaves its end values.
+
+    A cubic is monotone if its slopes at both ends have the sign of its chord and are at most three
+    times as steep. Where the chords before and after a waypoint differ in sign, its slope is zero.
+    """
+    before = np.vstack([chords[:1], chords])
+    after = np.vstack([chords, chords[-1:]])
+    directions = np.sign(after)
+    steepest = 3.0 * np.minimum(np.abs(before), np.abs(after))
+    limited_slopes = directions * np.clip(directions * slopes, 0.0, steepest)
+    return np.where(before * after > 0.0, limited_slopes, 0.0)
 
 
 def _exceeds_limits(
-    points: Floats, slopes: Floats, lengths: Floats, limits: tuple[Floats, Floats]
+    points: Floats, slopes: Floats, arc_lengths: Floats, limits: tuple[Floats, Floats]
 ) -> bool:
-    """Return whether the cubic of any coordinate exceeds its limits between two points."""
-    low, high = Curve(np.concatenate([[0.0], np.cumsum(lengths)]), points, slopes).compute_extrema()
-    is_low = low < np.minimum(limits[0], np.minimum(points[:-1], points[1:]))
-    is_high = high > np.maximum(limits[1], np.maximum(points[:-1], points[1:]))
-    return bool((is_low | is_high).any())
+    """Return whether the cubic of any coordinate exceeds its limits between two points.
+
+    Waypoints may exceed them, but cubics must not exceed their waypoints there.
+    """
+    low, high = Curve(arc_lengths, points, slopes).compute_extrema()
+    lower = np.minimum(limits[0], np.minimum(points[:-1], points[1:]))
+    upper = np.maximum(limits[1], np.maximum(points[:-1], points[1:]))
+    return bool(((low < lower) | (high > upper)).any())

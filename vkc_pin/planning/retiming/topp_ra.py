@@ -33,9 +33,14 @@ def compute_speeds(
 ) -> Floats | None:
     """Return the fastest speeds along a path at given positions, from rest to rest.
 
-    Between two positions the speed is linear in time. The speeds are those of TOPP-RA (Pham and
-    Pham, A new approach to time-optimal path parameterization based on reachability analysis,
-    2018), computed by the library `toppra`.
+    Between two positions the speed is linear in time. Along a path q(s), with the path velocity w
+    and acceleration u,
+
+        q̇ = q′ w,   q̈ = q′ u + q″ w²
+
+    so that all limits are linear in u and w². The speeds are those of TOPP-RA (Pham and Pham, A new
+    approach to time-optimal path parameterization based on reachability analysis, 2018), computed
+    by the library `toppra`.
 
     Args:
         path: Path of n coordinates.
@@ -55,13 +60,16 @@ def compute_speeds(
     if not len(limited):
         return None
     constraint = _make_toppra_constraint(velocity[limited], acceleration[limited], linear)
+    toppra_path = _to_toppra_path(path, limited)
     for offset in _KNOT_OFFSETS:
         grid = _replace_knots(path.x, positions, offset)
-        solver = TOPPRA(
-            [constraint], _to_toppra_path(path, limited), gridpoints=grid, solver_wrapper="seidel"
-        )
+        solver = TOPPRA([constraint], toppra_path, gridpoints=grid, solver_wrapper="seidel")
         _, speeds, _ = solver.compute_parameterization(0.0, 0.0)
-        if speeds is not None and np.isfinite(speeds).all() and (speeds[1:-1] > 0.0).all():
+        if speeds is None:
+            continue
+        is_moving = np.isfinite(speeds).all() and (speeds[1:-1] > 0.0).all()
+        if is_moving:
+            # At constant acceleration w² is linear in the position.
             return np.sqrt(np.interp(positions, grid, np.asarray(speeds) ** 2))
     return None
 
@@ -104,9 +112,11 @@ class _Placeholder(ModuleType):
 
 def _replace_knots(knots: Floats, positions: Floats, offset: float) -> Floats:
     """Return the grid with each interior knot replaced by two points beside it."""
-    gaps = np.minimum(np.diff(knots)[1:], np.diff(knots)[:-1]) * offset
+    widths = np.diff(knots)
+    gaps = np.minimum(widths[1:], widths[:-1]) * offset
     inside = knots[1:-1]
-    return np.sort(np.concatenate([np.setdiff1d(positions, inside), inside - gaps, inside + gaps]))
+    others = np.setdiff1d(positions, inside)
+    return np.sort(np.concatenate([others, inside - gaps, inside + gaps]))
 
 
 def _to_toppra_path(path: CubicPath, columns: Ints) -> Any:
@@ -130,7 +140,9 @@ def _make_toppra_constraint(
 ) -> Any:
     """Return the constraints of `compute_speeds` for `toppra`.
 
-    Linear ones hold at both ends of each grid interval.
+    Velocity limits bound w² by the smallest (limit / |q′|)². Acceleration limits are the rows
+    |q′ u + q″ w²| / limit ≤ 1 of the linear constraints, |a u + b w² + c| ≤ 1. These hold at both
+    ends of each grid interval.
     """
     from toppra.constraint import LinearConstraint
     from toppra.constraint.linear_constraint import canlinear_colloc_to_interpolate
@@ -143,18 +155,24 @@ def _make_toppra_constraint(
             self.identical = True
 
         def compute_constraint_params(self, path: Any, gridpoints: Floats) -> Any:
-            tangents, curvatures = (path(gridpoints, order) for order in (1, 2))
+            tangents = path(gridpoints, 1)
+            curvatures = path(gridpoints, 2)
             with np.errstate(divide="ignore"):
                 speeds = (velocity / np.abs(tangents)).min(axis=1)
-            squares = np.column_stack([np.zeros(len(speeds)), np.minimum(speeds, _MAX_SPEED) ** 2])
-            rows = [(tangents / acceleration, curvatures / acceleration, np.zeros_like(tangents))]
+            max_squares = np.minimum(speeds, _MAX_SPEED) ** 2
+            bounds_of_squares = np.column_stack([np.zeros(len(speeds)), max_squares])
+            a = tangents / acceleration
+            b = curvatures / acceleration
+            c = np.zeros_like(tangents)
             if linear is not None:
-                rows.append(linear(gridpoints))
-            a, b, c = (np.column_stack(parts) for parts in zip(*rows, strict=True))
-            both = np.vstack([np.eye(a.shape[1]), -np.eye(a.shape[1])])
+                further_a, further_b, further_c = linear(gridpoints)
+                a = np.column_stack([a, further_a])
+                b = np.column_stack([b, further_b])
+                c = np.column_stack([c, further_c])
+            signs = np.vstack([np.eye(a.shape[1]), -np.eye(a.shape[1])])
             coefficients = canlinear_colloc_to_interpolate(
-                a, b, c, both, np.ones(len(both)), None, None, gridpoints, identical=True
+                a, b, c, signs, np.ones(len(signs)), None, None, gridpoints, identical=True
             )
-            return *coefficients[:-1], squares
+            return *coefficients[:-1], bounds_of_squares
 
     return Constraint()

@@ -20,8 +20,9 @@ _BISECTIONS = 40
 class PathTorques(NamedTuple):
     """Torques at K positions of a path, relative to their limits, shape (K, m) each.
 
-    At path velocity w and acceleration u the torque is static + viscous · w + quadratic · w² +
-    inertial · u.
+    At path velocity w and acceleration u the torque is
+
+        τ(w, u) = static + viscous · w + quadratic · w² + inertial · u
     """
 
     static: Floats
@@ -32,15 +33,17 @@ class PathTorques(NamedTuple):
     def linearize(self, speeds: Floats) -> tuple[Floats, Floats, Floats]:
         """Return the coefficients of u, w² and 1, with w linearised in w² around `speeds`.
 
-        Joints that exceed their limit at rest may stay at that torque plus one per cent.
+        Around a speed v, w ≈ v/2 + w²/(2v). Joints that exceed their limit at rest may stay at that
+        torque plus one per cent.
 
         Args:
-            speeds: Path velocities, shape (K,).
+            speeds: Path velocities v, shape (K,).
         """
-        around = np.maximum(speeds, 1e-3 * max(float(speeds.max()), 1e-9))[:, None]
-        static = self.static + 0.5 * self.viscous * around
+        slowest = 1e-3 * max(float(speeds.max()), 1e-9)  # at rest, v = 0, there is no tangent
+        v = np.maximum(speeds, slowest)[:, None]
+        static = self.static + 0.5 * self.viscous * v
+        quadratic = self.quadratic + 0.5 * self.viscous / v
         scale = 1.0 / np.maximum(1.0, np.abs(self.static) * 1.01)
-        quadratic = self.quadratic + 0.5 * self.viscous / around
         return self.inertial * scale, quadratic * scale, static * scale
 
 
@@ -54,8 +57,9 @@ class TorqueBounds:
     """
 
     def __init__(self, torques: Torques, phases: Ints) -> None:
-        self._torques, self._phases = torques, phases
-        self._rows: dict[bytes, PathTorques] = {}
+        self._torques = torques
+        self._phases = phases
+        self._torques_by_positions: dict[bytes, PathTorques] = {}
         self._limited = np.flatnonzero(np.isfinite(torques.torque_limits.limits))
 
     def select_steps(self, first: int, count: int) -> TorqueBounds:
@@ -70,8 +74,12 @@ class TorqueBounds:
         velocities: Floats,
         accelerations: Floats,
     ) -> Floats:
-        """Return the torques relative to their limits, shape (K, m)."""
-        phases = self._phases[pieces // (n_pieces // len(self._phases))]
+        """Return the torques relative to their limits, shape (K, m).
+
+        `pieces` are the cubics, of `n_pieces` in all, that the K moments belong to.
+        """
+        pieces_per_step = n_pieces // len(self._phases)
+        phases = self._phases[pieces // pieces_per_step]
         torques = self._torques.at(phases, positions, velocities, accelerations)
         return torques[:, self._limited] / self._torques.torque_limits.limits[self._limited]
 
@@ -83,41 +91,67 @@ class TorqueBounds:
         `speeds` are those at `speed_positions`, shape (J,) each.
         """
         key = positions.tobytes()
-        if key not in self._rows:
-            self._rows[key] = self._evaluate_along_path(path, positions)
-        return self._rows[key].linearize(np.sqrt(np.interp(positions, speed_positions, speeds**2)))
+        if key not in self._torques_by_positions:
+            self._torques_by_positions[key] = self._evaluate_along_path(path, positions)
+        # At constant acceleration w² is linear in the position.
+        speeds_there = np.sqrt(np.interp(positions, speed_positions, speeds**2))
+        return self._torques_by_positions[key].linearize(speeds_there)
 
     def _evaluate_along_path(self, path: CubicPath, positions: Floats) -> PathTorques:
-        n_pieces, size = len(path.x) - 1, len(self._torques.trajectory.names)
-        pieces = np.clip(np.searchsorted(path.x, positions, side="right") - 1, 0, n_pieces - 1)
-        points, tangents, curvatures = (path(positions, order)[:, :size] for order in range(3))
-        at = [
-            self._compute_ratios(pieces, n_pieces, points, w * tangents, w**2 * curvatures)
-            for w in (1.0, 2.0, 3.0)
-        ]
-        pushed = self._compute_ratios(pieces, n_pieces, points, tangents, curvatures + tangents)
+        """Return the torques at positions of a path, shape (K,).
+
+        The coefficients follow from τ(1, 0), τ(2, 0), τ(3, 0) and τ(1, 1). At w and u the
+        velocities of the coordinates are q′ w and their accelerations q′ u + q″ w².
+        """
+        n_pieces = len(path.x) - 1
+        size = len(self._torques.trajectory.names)
+        pieces = np.searchsorted(path.x, positions, side="right") - 1
+        pieces = np.clip(pieces, 0, n_pieces - 1)
+        points = path(positions, 0)[:, :size]
+        tangents = path(positions, 1)[:, :size]
+        curvatures = path(positions, 2)[:, :size]
+
+        def compute_at(w: float) -> Floats:
+            return self._compute_ratios(pieces, n_pieces, points, w * tangents, w**2 * curvatures)
+
+        at_1 = compute_at(1.0)
+        at_2 = compute_at(2.0)
+        at_3 = compute_at(3.0)
+        accelerated = self._compute_ratios(
+            pieces, n_pieces, points, tangents, curvatures + tangents
+        )
         return PathTorques(
-            static=3.0 * at[0] - 3.0 * at[1] + at[2],
-            viscous=0.5 * (8.0 * at[1] - 5.0 * at[0] - 3.0 * at[2]),
-            quadratic=0.5 * (at[2] - 2.0 * at[1] + at[0]),
-            inertial=pushed - at[0],
+            static=3.0 * at_1 - 3.0 * at_2 + at_3,
+            viscous=0.5 * (8.0 * at_2 - 5.0 * at_1 - 3.0 * at_3),
+            quadratic=0.5 * (at_3 - 2.0 * at_2 + at_1),
+            inertial=accelerated - at_1,
         )
 
     def evaluate(self, curve: Curve) -> Floats:
         """Return the torque ratios at the ends and in the middle of each cubic, shape (K, m)."""
         moments = sample_curve(curve)
-        motion = moments.positions, moments.velocities, moments.accelerations
-        return self._compute_ratios(moments.pieces, len(curve.times) - 1, *motion)
+        return self._compute_ratios(
+            moments.pieces,
+            len(curve.times) - 1,
+            moments.positions,
+            moments.velocities,
+            moments.accelerations,
+        )
 
     def decompose(self, curve: Curve) -> tuple[Floats, Floats, Floats]:
         """Return the static, viscous and quadratic torques of a curve.
 
-        A curve slowed down by k has the torques static + viscous / k + quadratic / k².
+        A curve slowed down by k has the torques static + viscous / k + quadratic / k². Three
+        slowdowns determine the three unknowns.
         """
-        slowed = (Curve(curve.times * k, curve.positions, curve.rates / k) for k in _SLOWDOWNS)
-        at = np.array([self.evaluate(curve) for curve in slowed])
-        matrix = np.array([[1.0, 1.0 / k, 1.0 / k**2] for k in _SLOWDOWNS])
-        static, viscous, quadratic = np.tensordot(np.linalg.inv(matrix), at, axes=1)
+        torques = []
+        matrix = []
+        for k in _SLOWDOWNS:
+            slower = Curve(curve.times * k, curve.positions, curve.rates / k)
+            torques.append(self.evaluate(slower))
+            matrix.append([1.0, 1.0 / k, 1.0 / k**2])
+        inverse = np.linalg.inv(np.array(matrix))
+        static, viscous, quadratic = np.tensordot(inverse, np.array(torques), axes=1)
         return static, viscous, quadratic
 
     def slow_down(self, curve: Curve) -> Curve:
@@ -125,12 +159,17 @@ class TorqueBounds:
         static, viscous, quadratic = self.decompose(curve)
 
         def is_within_limits(factor: float) -> bool:
-            return bool((np.abs(static + viscous / factor + quadratic / factor**2) <= 1.0).all())
+            torques = static + viscous / factor + quadratic / factor**2
+            return bool((np.abs(torques) <= 1.0).all())
 
-        low, high = 1.0, _MAX_SLOWDOWN
+        low = 1.0
+        high = _MAX_SLOWDOWN
         if is_within_limits(low) or not is_within_limits(high):
             return curve
         for _ in range(_BISECTIONS):
             middle = 0.5 * (low + high)
-            low, high = (low, middle) if is_within_limits(middle) else (middle, high)
+            if is_within_limits(middle):
+                high = middle
+            else:
+                low = middle
         return Curve(curve.times * high, curve.positions, curve.rates / high)

@@ -54,47 +54,49 @@ def fit_rolling_paths(
         Paths with their waypoints; the travel of left and right wheels [m] follows the n
         coordinates.
     """
-    if rolling.turning_radius > 0.0 and (
-        direction_changes := _find_direction_changes(points, rolling)
-    ):
-        pieces = [
-            points[first : last + 1]
-            for first, last in itertools.pairwise([0, *direction_changes, len(points) - 1])
-        ]
-    else:
+    stops = list[int]()
+    if rolling.turning_radius > 0.0:
+        stops = _find_direction_changes(points, rolling)
+    if not stops:
         path, infeasible = _fit_without_stops(points, scale, limits, rolling, refinement)
         if len(points) == 2 or not infeasible.any():
             return [(path, points)]
-        stop = _choose_stop(points, infeasible, rolling)
-        pieces = [points[: stop + 1], points[stop:]]
-    return [
-        path
-        for piece in pieces
-        for path in fit_rolling_paths(piece, scale, limits, rolling, refinement)
-    ]
+        stops = [_choose_stop(points, infeasible, rolling)]
+    paths = []
+    for first, last in itertools.pairwise([0, *stops, len(points) - 1]):
+        piece = points[first : last + 1]
+        paths += fit_rolling_paths(piece, scale, limits, rolling, refinement)
+    return paths
 
 
 def compute_slip(curve: Curve) -> float:
     """Return the largest lateral velocity of the base [m/s]."""
     moments = sample_intervals(curve.times, np.arange(_SAMPLES_PER_CUBIC) / _SAMPLES_PER_CUBIC)
-    (vx, vy), yaw = curve.velocity(moments)[:, :2].T, curve.at(moments)[:, 2]
+    vx, vy = curve.velocity(moments)[:, :2].T
+    yaw = curve.at(moments)[:, 2]
     _, aside = rotate_into_base_frame(vx, vy, yaw)
     return float(np.abs(aside).max())
 
 
 def _find_direction_changes(points: Floats, rolling: RollingLimits) -> list[int]:
     """Return the waypoints between driving forward and backward, where a steered base stops."""
-    ahead = rolling.compute_steps(points)[0] > 0.0
-    return (1 + np.flatnonzero(ahead[1:] != ahead[:-1])).tolist()
+    along, _, _ = rolling.compute_steps(points)
+    is_forward = along > 0.0
+    return (1 + np.flatnonzero(is_forward[1:] != is_forward[:-1])).tolist()
 
 
 def _choose_stop(points: Floats, infeasible: Bools, rolling: RollingLimits) -> int:
-    """Return the end of an infeasible step at which the driving direction changes most."""
+    """Return the end of an infeasible step at which the driving direction changes most.
+
+    The direction is the unit vector of the displacements ahead and by turning, as travel of wheels.
+    """
     along, _, turn = rolling.compute_steps(points)
-    directions = np.column_stack([along, max(rolling.turning_radius, rolling.track / 2) * turn])
+    lever = max(rolling.turning_radius, rolling.track / 2)
+    directions = np.column_stack([along, lever * turn])
     directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-9)
     changes = np.linalg.norm(np.diff(directions, axis=0), axis=1)
-    return 1 + int(np.argmax(np.where(infeasible[1:] | infeasible[:-1], changes, -1.0)))
+    is_end_of_infeasible = infeasible[1:] | infeasible[:-1]
+    return 1 + int(np.argmax(np.where(is_end_of_infeasible, changes, -1.0)))
 
 
 def _fit_without_stops(
@@ -106,13 +108,19 @@ def _fit_without_stops(
 ) -> tuple[CubicPath, Bools]:
     """Return a path without stops, see `fit_rolling_paths`, and a mask of infeasible steps."""
     along, _, turn = rolling.compute_steps(points)
-    distance = np.concatenate([[0.0], np.cumsum(along / np.sinc(turn / (2 * np.pi)))])
-    # it reverses only where its driving direction changes
-    bounds = np.append(limits[0], np.inf), np.append(limits[1], -np.inf)
+    # An arc that turns by δθ is longer than its chord by the factor δθ/2 / sin(δθ/2), and sinc(x)
+    # is sin(πx)/(πx).
+    arcs = along / np.sinc(turn / (2 * np.pi))
+    distance = np.concatenate([[0.0], np.cumsum(arcs)])
+    # The bounds of the distance are empty: to exceed its values at the waypoints is to exceed them,
+    # so that it reverses only where its driving direction changes.
+    bounds = (np.append(limits[0], np.inf), np.append(limits[1], -np.inf))
     path = fit_path(np.column_stack([points, distance]), np.append(scale, 0.0), bounds)
-    parts = refinement * max(_MIN_PIECES, int(np.ceil(np.abs(turn).max() / _MAX_TURN_PER_PIECE)))
+    pieces_by_turn = int(np.ceil(np.abs(turn).max() / _MAX_TURN_PER_PIECE))
+    parts = refinement * max(_MIN_PIECES, pieces_by_turn)
     slopes = path(path.x, 1)[:, [2, -1]]
     if rolling.turning_radius > 0.0:
+        # dθ/ds = dθ/dℓ · dℓ/ds, with the curvature dθ/dℓ
         curvatures = _compute_curvatures(turn, np.diff(distance), rolling.turning_radius)
         slopes[:, 0] = curvatures * slopes[:, 1]
     steps = _StepFitter(points[:, :3], slopes, np.diff(path.x), np.diff(distance), parts)
@@ -124,13 +132,15 @@ def _fit_without_stops(
         gaps = steps.restore_arcs(tight)
         tight = steps.find_tight_steps(rolling.turning_radius)
     at = sample_intervals(path.x, np.arange(parts) / parts, last=True)
-    base, slopes, wheels = steps.evaluate_knots(gaps)
-    half = rolling.track / 2 * np.array([-1.0, 1.0])
-    values = np.column_stack([base, path(at)[:, 3:-1], wheels[0][:, None] + half * base[:, 2:]])
-    rates = np.column_stack(
-        [slopes, path(at, 1)[:, 3:-1], wheels[1][:, None] + half * slopes[:, 2:]]
-    )
-    return CubicPath(at, values, rates), (np.abs(gaps) > _MAX_GAP) | tight
+    base, base_slopes, (travel, travel_slopes) = steps.evaluate_knots(gaps)
+    # The left and right wheel, a track b apart, travel ℓ ∓ b/2 θ.
+    levers = rolling.track / 2 * np.array([-1.0, 1.0])
+    wheels = travel[:, None] + levers * base[:, 2:]
+    wheel_slopes = travel_slopes[:, None] + levers * base_slopes[:, 2:]
+    values = np.column_stack([base, path(at)[:, 3:-1], wheels])
+    rates = np.column_stack([base_slopes, path(at, 1)[:, 3:-1], wheel_slopes])
+    infeasible = (np.abs(gaps) > _MAX_GAP) | tight
+    return CubicPath(at, values, rates), infeasible
 
 
 def _compute_curvatures(turns: Floats, distances: Floats, radius: float) -> Floats:
@@ -138,70 +148,111 @@ def _compute_curvatures(turns: Floats, distances: Floats, radius: float) -> Floa
 
     A step of mean curvature κ, with a and b at its ends, has 3/2·κ − (a + b)/4 half-way: at most
     1/r if both are at least 3κ − 2/r. Otherwise the curvature is the mean of the adjacent steps'.
+
+    Args:
+        turns: Change of the heading in each step, shape (m − 1,) [rad].
+        distances: Distance driven in each step, shape (m − 1,) [m], negative backward.
+        radius: Minimum turning radius r [m].
     """
-    curvatures = radius * turns / np.where(np.abs(distances) > _MIN_DISTANCE, distances, np.inf)
-    lower, upper = np.minimum(3.0 * curvatures - 2.0, 1.0), np.maximum(3.0 * curvatures + 2.0, -1.0)
+    relative = radius * turns / np.where(np.abs(distances) > _MIN_DISTANCE, distances, np.inf)  # κr
+    lower = np.minimum(3.0 * relative - 2.0, 1.0)
+    upper = np.maximum(3.0 * relative + 2.0, -1.0)
     lengths = np.maximum(np.abs(distances), _MIN_DISTANCE)
-    mean = (curvatures[:-1] * lengths[1:] + curvatures[1:] * lengths[:-1]) / (
-        lengths[1:] + lengths[:-1]
-    )
-    inner = np.clip(mean, np.maximum(lower[:-1], lower[1:]), np.minimum(upper[:-1], upper[1:]))
-    return np.concatenate([curvatures[:1], inner, curvatures[-1:]]) / radius
+    # At the common end of two steps, their curvatures interpolated between the steps' middles.
+    weighted = relative[:-1] * lengths[1:] + relative[1:] * lengths[:-1]
+    mean = weighted / (lengths[1:] + lengths[:-1])
+    inner_lower = np.maximum(lower[:-1], lower[1:])
+    inner_upper = np.minimum(upper[:-1], upper[1:])
+    inner = np.clip(mean, inner_lower, inner_upper)
+    return np.concatenate([relative[:1], inner, relative[-1:]]) / radius
 
 
 class _StepFitter:
     """Fits the steps of a base between poses (N + 1, 3), each parametrised by s from 0 to 1.
 
-    `slopes`, shape (N + 1, 2), are derivatives of yaw and distance along the path.
+    In each step heading and distance are θ(s) and ℓ(s), and the position is the complex number
+
+        x + iy = x₀ + iy₀ + ∫ e^{iθ(s)} ℓ′(s) ds
+
+    integrated by Gauss-Legendre quadrature in each of `parts` equal parts.
+
+    Args:
+        poses: (x, y, yaw) at the ends of the steps, shape (N + 1, 3).
+        slopes: Derivatives of yaw and distance along the path, shape (N + 1, 2).
+        spans: Length of each step along the path, dpath/ds, shape (N,).
+        distances: Distance driven in each step, shape (N,) [m].
+        parts: Number of cubics of each step.
     """
 
     def __init__(
         self, poses: Floats, slopes: Floats, spans: Floats, distances: Floats, parts: int
     ) -> None:
-        self.poses, self.spans, self.parts = poses, spans[:, None], parts
-        self.yaw_slopes, self.distance_slopes = (
-            [column[:-1, None] * self.spans, column[1:, None] * self.spans] for column in slopes.T
-        )
-        self.distances = self._initial_distances = distances[:, None]
-        self.distance_bumps, self.heading_bumps = np.zeros((2, len(distances), 1))
-        nodes, weights = np.polynomial.legendre.leggauss(5)
+        self.poses = poses
+        self.spans = spans[:, None]
+        self.parts = parts
+        # Derivatives by s at the begin and at the end of each step.
+        self._begin_slopes = slopes[:-1, None] * self.spans[..., None]
+        self._end_slopes = slopes[1:, None] * self.spans[..., None]
+        self._initial_distances = distances[:, None]
+        self.distances = self._initial_distances
+        self.distance_bumps = np.zeros((len(distances), 1))
+        self.heading_bumps = np.zeros((len(distances), 1))
+        nodes, weights = np.polynomial.legendre.leggauss(5)  # on [-1, 1]
         self._nodes = ((np.arange(parts)[:, None] + (nodes + 1) / 2) / parts).ravel()
         self._weights = np.tile(weights / (2 * parts), parts)
 
     def compute_heading(self, s: Floats) -> tuple[Floats, Floats]:
         """Return the yaw and its derivative at s, shape (K,): shape (N, K) each."""
-        before, change = self.poses[:-1, 2:], np.diff(self.poses[:, 2:], axis=0)
-        value, slope = _evaluate_hermite(s, change, *self.yaw_slopes)
+        before = self.poses[:-1, 2:]
+        change = np.diff(self.poses[:, 2:], axis=0)
+        begin = self._begin_slopes[..., 0]
+        end = self._end_slopes[..., 0]
+        value, slope = _evaluate_hermite(s, change, begin, end)
         bump, bump_slope = _evaluate_bump(s)
         yaw = before + value + self.heading_bumps * bump
         return yaw, slope + self.heading_bumps * bump_slope
 
     def compute_distance(self, s: Floats) -> tuple[Floats, Floats]:
         """Return the distance driven in each step and its derivative at s, shape (N, K) each."""
-        value, slope = _evaluate_hermite(s, self.distances, *self.distance_slopes)
+        begin = self._begin_slopes[..., 1]
+        end = self._end_slopes[..., 1]
+        value, slope = _evaluate_hermite(s, self.distances, begin, end)
         bump, bump_slope = _evaluate_bump(s)
-        return value + self.distance_bumps * bump, slope + self.distance_bumps * bump_slope
+        distance = value + self.distance_bumps * bump
+        return distance, slope + self.distance_bumps * bump_slope
 
     def fit(self) -> Floats:
-        """Fit the steps to reach the next pose; return the remaining gaps, see `compute_gap`."""
-        s, w = self._nodes, self._weights
+        """Fit the steps to reach the next pose; return the remaining gaps, see `compute_gap`.
+
+        The parameters p of a step are its distance and the bumps of ℓ and θ. With the gap g(p) to
+        the next pose and the costs c of the bumps (none of the distance), Gauss-Newton steps
+
+            (JᵀJ + diag(c)) δp = Jᵀg − diag(c) p,   J = −∂g/∂p
+
+        lead to the minimum of |g|² + Σ c p². The columns of J, as complex numbers, are the
+        integrals of e^{iθ} ∂ℓ′/∂p and of i ℓ′ e^{iθ} ∂θ/∂p.
+        """
+        s = self._nodes
+        w = self._weights
         cost = np.array([0.0, _CLOSURE_SCALE**2, (_CLOSURE_SCALE * _HEADING_LEVER) ** 2])
+        bump, bump_slope = _evaluate_bump(s)
         for _ in range(_NEWTON_ITERATIONS):
-            direction, gap = np.exp(1j * self.compute_heading(s)[0]), self.compute_gap()
-            bump, bump_slope = _evaluate_bump(s)
-            columns = [
-                direction @ (w * 6.0 * (s - s**2)),
-                direction @ (w * bump_slope),
-                1j * (self.compute_distance(s)[1] * direction) @ (w * bump),
-            ]
-            effects = np.stack(columns, axis=1)
-            slopes = np.stack([effects.real, effects.imag], axis=1)
-            bumps = [0.0 * self.distances, self.distance_bumps, self.heading_bumps]
-            transposed, gap = np.swapaxes(slopes, 1, 2), np.stack([gap.real, gap.imag], axis=1)
-            residual = (transposed @ gap[..., None])[..., 0] - cost * np.stack(bumps, axis=1)[
-                ..., 0
-            ]
-            change = np.linalg.solve(transposed @ slopes + np.diag(cost), residual[..., None])
+            heading, _ = self.compute_heading(s)
+            _, speed = self.compute_distance(s)
+            direction = np.exp(1j * heading)
+            by_distance = direction @ (w * 6.0 * (s - s**2))
+            by_distance_bump = direction @ (w * bump_slope)
+            by_heading_bump = 1j * (speed * direction) @ (w * bump)
+            effects = np.stack([by_distance, by_distance_bump, by_heading_bump], axis=1)
+            jacobian = np.stack([effects.real, effects.imag], axis=1)
+            transposed = np.swapaxes(jacobian, 1, 2)
+            complex_gap = self.compute_gap()
+            gap = np.stack([complex_gap.real, complex_gap.imag], axis=1)[..., None]
+            no_cost = 0.0 * self.distances
+            bumps = np.stack([no_cost, self.distance_bumps, self.heading_bumps], axis=1)
+            residual = (transposed @ gap)[..., 0] - cost * bumps[..., 0]
+            matrix = transposed @ jacobian + np.diag(cost)
+            change = np.linalg.solve(matrix, residual[..., None])
             self.distances = self.distances + change[:, 0]
             self.distance_bumps = self.distance_bumps + change[:, 1]
             self.heading_bumps = self.heading_bumps + change[:, 2]
@@ -211,13 +262,18 @@ class _StepFitter:
 
     def restore_arcs(self, which: Bools) -> Floats:
         """Undo `fit` for a mask of steps, (N,), whose arcs are accurate enough; return the gaps."""
-        fitted = self.distances, self.distance_bumps, self.heading_bumps
-        arcs = self._initial_distances, 0.0 * self.distance_bumps, 0.0 * self.heading_bumps
-        self.distances, self.distance_bumps, self.heading_bumps = arcs
-        restored = (which & (np.abs(self.compute_gap()) < _MAX_GAP_OF_ARC))[:, None]
-        self.distances, self.distance_bumps, self.heading_bumps = (
-            np.where(restored, new, old) for new, old in zip(arcs, fitted, strict=True)
-        )
+        fitted_distances = self.distances
+        fitted_distance_bumps = self.distance_bumps
+        fitted_heading_bumps = self.heading_bumps
+        # without bumps the steps are arcs
+        self.distances = self._initial_distances
+        self.distance_bumps = 0.0 * fitted_distance_bumps
+        self.heading_bumps = 0.0 * fitted_heading_bumps
+        is_accurate = np.abs(self.compute_gap()) < _MAX_GAP_OF_ARC
+        restored = (which & is_accurate)[:, None]
+        self.distances = np.where(restored, self.distances, fitted_distances)
+        self.distance_bumps = np.where(restored, self.distance_bumps, fitted_distance_bumps)
+        self.heading_bumps = np.where(restored, self.heading_bumps, fitted_heading_bumps)
         return self.compute_gap()
 
     def compute_gap(self) -> Floats:
@@ -226,31 +282,50 @@ class _StepFitter:
         return np.asarray(dx + 1j * dy - self._compute_velocity() @ self._weights)
 
     def _compute_velocity(self) -> Floats:
-        direction = np.exp(1j * self.compute_heading(self._nodes)[0])
-        return np.asarray(self.compute_distance(self._nodes)[1] * direction)
+        """Return e^{iθ} ℓ′ at the nodes of the quadrature, shape (N, K), complex."""
+        heading, _ = self.compute_heading(self._nodes)
+        _, speed = self.compute_distance(self._nodes)
+        return np.asarray(speed * np.exp(1j * heading))
 
     def evaluate_knots(self, gaps: Floats) -> tuple[Floats, Floats, tuple[Floats, Floats]]:
-        """Return poses and distances at the knots, with their derivatives, gaps distributed."""
+        """Evaluate the steps at their knots, with the gaps distributed over them.
+
+        Returns:
+            Poses and their derivatives along the path, shape (K, 3) each, and the distances driven
+            and their derivatives, shape (K,) each.
+        """
         s = np.arange(self.parts + 1) / self.parts
-        pieces = (self._compute_velocity() * self._weights).reshape(len(gaps), self.parts, -1)
-        travelled = np.cumsum(pieces.sum(axis=2), axis=1)
+        displacements = (self._compute_velocity() * self._weights).reshape(
+            len(gaps), self.parts, -1
+        )
+        travelled = np.cumsum(displacements.sum(axis=2), axis=1)
         travelled = np.concatenate([np.zeros((len(gaps), 1)), travelled], axis=1)
         begin = self.poses[:-1, :1] + 1j * self.poses[:-1, 1:2]
         place = begin + travelled + gaps[:, None] * (3.0 - 2.0 * s) * s**2
-        (yaw, yaw_rate), (distance, speed) = self.compute_heading(s), self.compute_distance(s)
-        start_distance = np.concatenate([[[0.0]], np.cumsum(self.distances, axis=0)[:-1]])
+        yaw, yaw_rate = self.compute_heading(s)
+        distance, speed = self.compute_distance(s)
         velocity = speed * np.exp(1j * yaw)
-        parts = (place.real, place.imag, yaw, start_distance + distance)
-        values = [_concatenate_steps(part) for part in parts]
-        rates = (velocity.real, velocity.imag, yaw_rate, speed)
-        slopes = [_concatenate_steps(part / self.spans) for part in rates]
-        return np.column_stack(values[:3]), np.column_stack(slopes[:3]), (values[3], slopes[3])
+        start_distance = np.concatenate([[[0.0]], np.cumsum(self.distances, axis=0)[:-1]])
+        poses = np.column_stack(
+            [_concatenate_steps(part) for part in (place.real, place.imag, yaw)]
+        )
+        slopes = np.column_stack(
+            [
+                _concatenate_steps(rate / self.spans)
+                for rate in (velocity.real, velocity.imag, yaw_rate)
+            ]
+        )
+        distances = _concatenate_steps(start_distance + distance)
+        distance_slopes = _concatenate_steps(speed / self.spans)
+        return poses, slopes, (distances, distance_slopes)
 
     def find_tight_steps(self, radius: float) -> Bools:
         """Return a mask of steps with a turning radius below `radius` [m], shape (N,)."""
-        s = np.linspace(0.0, 1.0, 8 * self.parts + 1)
-        (_, yaw_rate), (_, speed) = self.compute_heading(s), self.compute_distance(s)
-        allowed = (1.0 + _RADIUS_TOLERANCE) * np.abs(speed) + 1e-9
+        s = np.linspace(0.0, 1.0, _SAMPLES_PER_CUBIC * self.parts + 1)
+        _, yaw_rate = self.compute_heading(s)
+        _, speed = self.compute_distance(s)
+        # r |dθ/ds| ≤ |dℓ/ds|
+        allowed = (1.0 + _RADIUS_TOLERANCE) * np.abs(speed) + _MIN_DISTANCE
         return np.asarray((radius * np.abs(yaw_rate) > allowed).any(axis=1))
 
 
@@ -259,6 +334,7 @@ def _evaluate_hermite(
 ) -> tuple[Floats, Floats]:
     """Return cubics from 0 to `change` with given end slopes, and their derivatives, at s."""
     value = change * (3.0 - 2.0 * s) * s**2 + before * s * (1.0 - s) ** 2 - after * s**2 * (1.0 - s)
+    # of 3s² − 2s³, s − 2s² + s³ and s³ − s²
     slope = (
         change * 6.0 * (s - s**2)
         + before * (1.0 - 4.0 * s + 3.0 * s**2)
@@ -269,7 +345,9 @@ def _evaluate_hermite(
 
 def _evaluate_bump(s: Floats) -> tuple[Floats, Floats]:
     """Return 16s²(1 − s)², which is flat at both ends and 1 half-way, and its derivative."""
-    return 16.0 * (s * (1.0 - s)) ** 2, 32.0 * s * (1.0 - s) * (1.0 - 2.0 * s)
+    bump = 16.0 * (s * (1.0 - s)) ** 2
+    slope = 32.0 * s * (1.0 - s) * (1.0 - 2.0 * s)
+    return bump, slope
 
 
 def _concatenate_steps(parts: Floats) -> Floats:

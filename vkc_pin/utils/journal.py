@@ -120,9 +120,12 @@ class JournalContents:
             except (ValueError, LookupError, RecursionError) as error:
                 if isinstance(error, InputError) and error.file is not None:
                     raise
-                problem, expected = "this line is damaged", "the lines that a run writes"
                 raise InputError(
-                    problem, file=path, line=number, expected=expected, got=str(error)
+                    "this line is damaged",
+                    file=path,
+                    line=number,
+                    expected="the lines that a run writes",
+                    got=str(error),
                 ) from error
             end += len(text)
         return end

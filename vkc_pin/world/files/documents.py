@@ -320,8 +320,12 @@ def _check_depth(events: Iterable[yaml.Event], file: Path) -> None:
             depth += 1
             if depth > MAX_DEPTH:
                 line = event.start_mark.line + 1 if event.start_mark else None
-                problem, expected = "too many lists inside each other", f"at most {MAX_DEPTH}"
-                raise InputError(problem, file=file, line=line, expected=expected)
+                raise InputError(
+                    "too many lists inside each other",
+                    file=file,
+                    line=line,
+                    expected=f"at most {MAX_DEPTH}",
+                )
         elif isinstance(event, yaml.CollectionEndEvent):
             depth -= 1
 

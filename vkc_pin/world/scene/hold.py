@@ -292,7 +292,8 @@ def make_holds(
 
 def _split_frame(frame: Any) -> tuple[str, str]:
     """Return object and link of a label "<object>.<link>"."""
-    owner, _, link = frame.partition(".") if isinstance(frame, str) else ("", "", "")
+    text = frame if isinstance(frame, str) else ""
+    owner, _, link = text.partition(".")
     if not link:
         raise InputError(
             "not a link of an object",

@@ -202,9 +202,11 @@ class Curve:
             InputError: A waypoint is not one of the knots. Times must be equal to the last bit.
         """
         if self.positions.shape[1] != positions.shape[1]:
-            expected, got = positions.shape[1], self.positions.shape[1]
             raise InputError(
-                "wrong number of coordinates", field="curve.positions", expected=expected, got=got
+                "wrong number of coordinates",
+                field="curve.positions",
+                expected=positions.shape[1],
+                got=self.positions.shape[1],
             )
         last = len(self.times) - 1
         at = np.minimum(np.searchsorted(self.times, times), last)

@@ -100,8 +100,8 @@ def _read_arrays(data: bytes) -> dict[str, Any]:
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         names = sorted(name.removesuffix(".npy") for name in archive.namelist())
         if names not in (sorted(_ARRAYS), sorted(_PARTS)):
-            found, expected = ", ".join(names) or "none", ", ".join(sorted(_ARRAYS))
-            raise ValueError(f"its parts are {found}, not {expected}")
+            expected = ", ".join(sorted(_ARRAYS))
+            raise ValueError(f"its parts are {', '.join(names) or 'none'}, not {expected}")
         return {
             info.filename.removesuffix(".npy"): _read_array(archive, info)
             for info in archive.infolist()

@@ -29,6 +29,7 @@ from .world.models.object_file import load_object
 from .world.models.robot import Robot
 from .world.models.robot_file import load_robot
 from .world.scene.hold import Hold
+from .world.scene.joint_estimation import JointEstimate, estimate_joint
 from .world.scene.placed_object import PlacedObject
 from .world.scene.scene import Scene, load_scene
 from .world.task.steps import Actuate, Configure, GoTo, Grasp, Place, Reach, Release, Touch
@@ -53,6 +54,7 @@ __all__ = [
     "Hold",
     "InputError",
     "Iteration",
+    "JointEstimate",
     "Latch",
     "Options",
     "PhaseSpan",
@@ -84,6 +86,7 @@ __all__ = [
     "consolidate",
     "cpin",
     "datasets",
+    "estimate_joint",
     "experiments",
     "importing",
     "inverse_kinematics",

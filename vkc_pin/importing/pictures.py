@@ -1,4 +1,4 @@
-"""Draws imported robots and objects, so that what was proposed can be seen."""
+"""Draws imported robots and objects, with the proposed attachments and the tool frame."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def _draw(axes: Any, proposals: Proposals, proposal: Proposal, joint: str) -> No
     in_link = attachment.tool(np.zeros(len(attachment.freedoms)))
     tool = item.link_placement(attachment.link, state) * in_link
     if attachment.contact == "push":
-        # The foremost point of the hand is there.
+        # It is the frame of the hand's foremost point.
         tool = tool * pin.SE3(np.eye(3), np.array([0.0, 0.0, -proposals.hand.tip]))
     for geometry, where in (*proposals.hand.touch, *proposals.hand.others):
         triangles.add(geometry, tool * where, to_rgb(COLOURS[0]))

@@ -304,7 +304,7 @@ class _Reader:
     # Equalities and key frames
 
     def _read_equalities(self) -> tuple[list[Coupling], list[Loop]]:
-        """Return what the equalities that are active at first mean."""
+        """Return the couplings and loops of the equalities that are active at first."""
         model = self._model
         kinds = self._mujoco.mjtEq
         couplings = list[Coupling]()

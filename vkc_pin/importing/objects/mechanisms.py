@@ -10,7 +10,7 @@ from vkc_pin.importing.description import Coupling, Description, Joint, Limits, 
 
 
 def dissolve_mechanisms(description: Description) -> Description:
-    """Return an object whose joints are independent, with notes about what was changed.
+    """Return an object whose joints are independent, with a note about each change.
 
     - A free link that is connected or welded to another link is fixed to it.
     - Other links that are connected or welded close a loop, whose joints are held where they are

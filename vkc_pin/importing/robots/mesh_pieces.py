@@ -103,7 +103,7 @@ def write_meshes(
 
 
 def _decompose(link: str, shape: UrdfShape, most_pieces: int | None, notes: list[str]) -> Pieces:
-    """Return the convex pieces of a mesh, and note what is flat or protrudes far."""
+    """Return the convex pieces of a mesh, and note flat meshes and pieces that protrude far."""
     assert shape.file is not None
     mesh = load_mesh(shape.file, shape.size)
     error = min(_MAX_ERROR, _MAX_RELATIVE_ERROR * float(mesh.extents.max()))

@@ -238,7 +238,7 @@ class _Reader:
         code = int(self._model.geom_type[geom])
         name = self._find_shape_name(geom)
         size = tuple(float(value) for value in self._model.geom_size[geom])
-        radius, half_length = size[0], size[1]
+        radius, half_length, _ = size
         triangles = None
         if code == types.mjGEOM_BOX:
             kind = "box"

@@ -56,6 +56,7 @@ def find_shell_lines(page: Path) -> list[str]:
     return [line for block in blocks for line in block.splitlines()]
 
 
+# Pages whose code runs for long
 LONG_PAGES = (
     "baselines",
     "chores",
@@ -69,7 +70,7 @@ LONG_PAGES = (
     "reading_failures",
     "robots",
     "tutorial",
-)  # pages whose code runs for long
+)
 
 
 def find_snippets() -> list[object]:

@@ -59,18 +59,15 @@ AXES = {
     "segments": Axis((20, 40, 80, 160, 320), 80, "Opening the door in more and more segments"),
 }
 """By the field of a trial's record."""
-_OPENED = {
-    "obstacles": 1.2,
-    "segments": 0.6,
-}  # [rad] of the hinge: 20 segments are too few for a larger motion
-_WEST, _EAST, _SOUTH, _NORTH, _HALL, _CEILING = (
-    -2.5,
-    2.5,
-    -2.0,
-    2.0,
-    5.1,
-    2.4,
-)  # [m]: faces of the walls
+# [rad] of the hinge: 20 segments are too few for a larger motion
+_OPENED = {"obstacles": 1.2, "segments": 0.6}
+# Faces of the walls [m]
+_WEST = -2.5
+_EAST = 2.5
+_SOUTH = -2.0
+_NORTH = 2.0
+_HALL = 5.1
+_CEILING = 2.4
 
 
 def make_crowded_scene(count: int, *, seed: int = 0) -> Scene:
@@ -79,9 +76,8 @@ def make_crowded_scene(count: int, *, seed: int = 0) -> Scene:
     The boxes are on walls and ceiling or outside the room. Larger counts contain the smaller ones.
     """
     scene = load_scene("door")
-    own = sorted(
-        scene.document["obstacles"], key=lambda item: "wall" not in item["name"]
-    )  # keeps the order otherwise
+    # The order stays otherwise.
+    own = sorted(scene.document["obstacles"], key=lambda item: "wall" not in item["name"])
     rng = np.random.default_rng(seed)
     boxes = [_box(rng, number) for number in range(count - len(own))]
     return Scene.from_document(

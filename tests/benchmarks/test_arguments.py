@@ -46,11 +46,8 @@ WRONG: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
     (household.run, {**ONE, "tasks": ["fridge"]}, "there is no task 'fridge'"),
     (household.run, {**ONE, "variant": "papers"}, "there is no variant 'papers'"),
     (impossible.run, {"problems": 0}, "at least 1"),
-    (
-        initialization.run,
-        {**ONE_START, "repeats": 1, "scenes": ["door"]},
-        "init_1",
-    ),  # the scene has no stick
+    # The scene has no stick.
+    (initialization.run, {**ONE_START, "repeats": 1, "scenes": ["door"]}, "init_1"),
     (
         initialization.run,
         {**ONE_START, "repeats": 1, "scenes": []},

@@ -93,13 +93,14 @@ def _make_content(case: dict[str, Any]) -> bytes:
         try:
             parts[case["array"]] = np.asarray(value)
             return _write_archive(parts.pop("about"), parts)
+        # Not an array, or impossible to pickle
         except (
             ValueError,
             TypeError,
             RuntimeError,
             AttributeError,
             RecursionError,
-        ):  # not an array, or impossible to pickle
+        ):
             return b""
     data = _write_archive(np.array(json.dumps(about)), arrays)
     if "member" in case:

@@ -18,16 +18,13 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-STICK = pin.SE3(
-    np.eye(3), np.array([0.8, 0.0, 0.55])
-)  # along y, its tip to the left; its discs reach 0.05 m below it
+# Along y, its tip to the left; its discs reach 0.05 m below it.
+STICK = pin.SE3(np.eye(3), np.array([0.8, 0.0, 0.55]))
 TOP = 0.5  # height of the table [m]
-BALL = pin.SE3(
-    np.eye(3), np.array([0.8, 0.285, 0.7])
-)  # touched by the tip of a stick grasped at this height
-GUESS = np.array(
-    [0.0, 0.0, 0.0, 0.07, -1.69, -1.39, -1.63, 1.57, -1.5]
-)  # the hand above the table, pointing down
+# The tip of a stick grasped at this height touches it.
+BALL = pin.SE3(np.eye(3), np.array([0.8, 0.285, 0.7]))
+# The hand is above the table, pointing down.
+GUESS = np.array([0.0, 0.0, 0.0, 0.07, -1.69, -1.39, -1.63, 1.57, -1.5])
 UP = np.array([0.0, 0.0, 0.2])
 FREE = {"stick": STICK, "ball": BALL}
 

@@ -19,9 +19,8 @@ from vkc_pin.world.scene.scene import Scene, load_scene
 
 MARGIN, HAND_CLEARANCE = 0.02, 0.005  # [m]: Options.dist_safe and Options.grasp_clearance
 SHORT = Options(reach_waypoints=5, turn_waypoints=3, move_waypoints=8)
-NEAR_HANDLE = np.array(
-    [0.63, 0.08, 0.42, 2.288, -0.13, -0.55, 0.681, 1.141, 1.571]
-)  # near the handle of the closed drawer
+# The hand is near the handle of the closed drawer.
+NEAR_HANDLE = np.array([0.63, 0.08, 0.42, 2.288, -0.13, -0.55, 0.681, 1.141, 1.571])
 
 
 @cache

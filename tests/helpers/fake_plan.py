@@ -50,15 +50,10 @@ def make_fake_plan(scene: Scene | None = None) -> Plan:
     """Return a plan of 6 s in two phases, with a collision of forearm and sofa at 4 s."""
     scene = load_scene("door") if scene is None else scene
     robot = scene.robot.coordinates.names
-    names = (
-        *robot,
-        "door.hinge",
-        "door.knob",
-        "door.handle_free",
-    )  # the last is the virtual joint of a grasp
-    times = np.concatenate(
-        [np.linspace(0.0, 3.0, 7), 3.0 + np.geomspace(0.1, 3.0, 7)]
-    )  # not evenly spaced
+    # The last is the virtual joint of a grasp.
+    names = (*robot, "door.hinge", "door.knob", "door.handle_free")
+    # Times are not evenly spaced.
+    times = np.concatenate([np.linspace(0.0, 3.0, 7), 3.0 + np.geomspace(0.1, 3.0, 7)])
     fraction = np.linspace(0.0, 1.0, len(times))
     start = np.concatenate([scene.start, np.zeros(3)])
     end = start + np.concatenate(

@@ -69,9 +69,8 @@ def write_home_urdf(folder: Path) -> tuple[Path, int]:
         _add_link(robot, "carpet", "fixed", (0.0, -1.5, 0.0)), (2.0, 1.0, 0.01), (0.0, 0.0, 0.005)
     )
     for k, y in enumerate((0.2, 0.6)):
-        _add_cylinder(
-            _add_link(robot, f"cup_{k}", "floating", (0.25, y, 0.749)), 0.03, 0.1
-        )  # 1 mm inside the table
+        # Cups are 1 mm inside the table.
+        _add_cylinder(_add_link(robot, f"cup_{k}", "floating", (0.25, y, 0.749)), 0.03, 0.1)
     _add_box(
         _add_link(robot, "lump", "floating", (2.0, 5.0, 0.0)), (0.4, 0.4, 0.4), (0.0, 0.0, 0.2)
     )

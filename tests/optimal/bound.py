@@ -30,10 +30,8 @@ def compute_bound(scene: Scene, motion: Trajectory, points: int = FINE) -> tuple
     make_straight_curve = retime._make_straight_curve
 
     def record_path(path: Any, places: Any, *limits: Any) -> Any:
-        paths[id(path)] = (
-            path,
-            *limits,
-        )  # the last call includes torque limits if they bind
+        # The last call includes torque limits if they bind.
+        paths[id(path)] = (path, *limits)
         return compute_speeds(path, places, *limits)
 
     def record_rest(*arguments: Any) -> Any:

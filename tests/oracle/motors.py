@@ -22,10 +22,9 @@ GRAVITY = np.array([0.0, 0.0, -9.81])
 GRIP = 0.1  # [m] lever that converts torques of the hand to forces
 EXCESS = 0.01  # relative excess over a limit
 STILL = 1e-6
-_SHARES, _STEP = (
-    np.array([0.03, 0.5, 0.97]),
-    0.025,
-)  # positions and step of the differences, relative to the duration of a cubic
+# Positions and step of the differences, relative to the duration of a cubic
+_SHARES = np.array([0.03, 0.5, 0.97])
+_STEP = 0.025
 _NUDGE = 1e-6  # [m] or [rad]
 
 

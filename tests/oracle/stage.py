@@ -174,10 +174,9 @@ class World:
 
     def compute_front(self, opening: float | None) -> Poses:
         """Return the foremost point of the hand in the tool's frame, at an opening [m]."""
-        robot, wall = (
-            self.robot,
-            coal.Halfspace(np.array([0.0, 0.0, -1.0]), -1.0),
-        )  # all points at least a metre ahead
+        robot = self.robot
+        # All points at least a metre ahead
+        wall = coal.Halfspace(np.array([0.0, 0.0, -1.0]), -1.0)
         fingers = self.fingers.find_joints(self.fingers.clip_opening(opening))
         frames = robot.tree.compute_links(
             {**robot.locked, **fingers}, None, sorted({robot.tool, *robot.touch_links})

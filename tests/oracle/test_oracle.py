@@ -246,9 +246,8 @@ def test_cup_in_a_drawer_moves_with_it(plans: dict[str, Path], tmp_path: Path) -
 
 def _add_cup(c: Content) -> None:
     x, y, _ = c["scene"]["objects"][0]["position"]
-    c["scene"]["objects"].append(
-        {"name": "cup", "type": "cup", "position": [x + 0.15, y, 0.653]}
-    )  # 1 mm above the tray's bottom
+    # The cup is 1 mm above the tray's bottom.
+    c["scene"]["objects"].append({"name": "cup", "type": "cup", "position": [x + 0.15, y, 0.653]})
 
 
 def test_cup_on_a_tilting_door_tips(plans: dict[str, Path], tmp_path: Path) -> None:

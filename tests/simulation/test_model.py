@@ -91,9 +91,8 @@ def test_masses_agree_with_pinocchio() -> None:
         assert physical.model.body_mass[body] == pytest.approx(inertia.mass)
         np.testing.assert_allclose(physical.model.body_ipos[body], inertia.lever, atol=1e-9)
         principal = np.sort(np.linalg.eigvalsh(np.asarray(inertia.inertia)))
-        principal += max(
-            0.0, principal[2] - principal[0] - principal[1]
-        )  # the cabinet's inertias are rounded
+        # The cabinet's inertias are rounded.
+        principal += max(0.0, principal[2] - principal[0] - principal[1])
         np.testing.assert_allclose(np.sort(physical.model.body_inertia[body]), principal, rtol=1e-3)
 
 

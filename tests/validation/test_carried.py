@@ -181,9 +181,8 @@ def test_firm_grasps_must_not_slide(column: str, by: float, unit: str) -> None:
     assert (found.subject, found.unit) == (f"stick.{column}", unit)
     assert found.amount == pytest.approx(abs(by))
     assert phase.first < found.waypoint <= phase.last
-    assert (
-        report.closure_error < 1e-9
-    )  # the hand follows the coordinates, so that closure does not show the slide
+    # The hand follows the coordinates, so that closure does not show the slide.
+    assert report.closure_error < 1e-9
     loose = replace_grasp(make_hall(), "stick", "grip", firm=False)
     assert "slide" not in {v.constraint for v in judge([vkc.Release()], motion, loose).violations}
 
@@ -453,9 +452,8 @@ def test_position_error_of_a_grasp_by_a_tool_is_reported() -> None:
     )
     assert ("goal", "ball.pull") in get_violation_names(grasped)
     by_hand = judge([vkc.Grasp("ball", "pull"), FETCHED], fetch_ball())
-    assert ("goal", "ball.pull") in get_violation_names(
-        by_hand
-    )  # the hand itself never reaches the ball
+    # The hand itself never reaches the ball.
+    assert ("goal", "ball.pull") in get_violation_names(by_hand)
 
 
 def test_tool_must_not_penetrate_the_grasped_object() -> None:

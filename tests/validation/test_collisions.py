@@ -176,9 +176,8 @@ def test_closest_pair_of_every_waypoint_is_found() -> None:
     table = make_table(door, motion)
     z = table.world.compute_positions(motion, motion.times)
     robots = np.array([group == "robot" for group in table.groups])
-    with_others = np.flatnonzero(
-        robots[table.pairs].sum(axis=1) == 1
-    )  # the robot is close to itself everywhere, as is the door
+    # The robot is close to itself everywhere, as is the door.
+    with_others = np.flatnonzero(robots[table.pairs].sum(axis=1) == 1)
     table.pairs, table.margins = table.pairs[with_others], table.margins[with_others]
     least = np.full(len(z), np.inf)
     for hit in sweep(table, z, np.arange(len(z))):

@@ -200,11 +200,8 @@ def test_carried_object_may_be_close_to_its_supports() -> None:
 @pytest.mark.parametrize(
     ("gap", "allow", "expected"),
     [
-        (
-            0.005,
-            [],
-            (2, 6, 0.0, CONTACT_DEPTH, False, True),
-        ),  # until the front, 18 mm thick, is √(20² - 5²) mm past it
+        # Until the front, 18 mm thick, is √(20² - 5²) mm past it
+        (0.005, [], (2, 6, 0.0, CONTACT_DEPTH, False, True)),
         (-0.002, [], (2, 6, -0.005, CONTACT_DEPTH + 0.005, False, True)),
         (
             -0.002,

@@ -216,16 +216,10 @@ def test_latch_violation_of_a_planned_motion_is_reported(door_plan: vkc.Plan) ->
     ("hinge", "knob", "shortfall"),
     [
         ([0.0, 0.0, 0.3], [0.0, 0.5, 0.5], 0.0),  # turned, then pushed
-        (
-            [0.0, 0.3, 0.3],
-            [0.0, 0.6, 0.6],
-            0.5,
-        ),  # both at once: the hinge leaves with the knob at 0
-        (
-            [0.0, 0.0, 0.3],
-            [0.0, 0.6, 0.0],
-            0.0,
-        ),  # 0.6 − 0.6 · 0.05 / 0.3 = 0.5 at the end of the latch's reach
+        # Both at once: the hinge leaves with the knob at 0.
+        ([0.0, 0.3, 0.3], [0.0, 0.6, 0.6], 0.5),
+        # 0.6 − 0.6 · 0.05 / 0.3 = 0.5 at the end of the latch's reach
+        ([0.0, 0.0, 0.3], [0.0, 0.6, 0.0], 0.0),
         ([0.0, 0.0, 0.3], [0.0, 0.58, 0.0], 0.5 - 0.58 * 5 / 6),
         ([0.0, 0.0, -0.3], [0.0, 0.3, 0.3], 0.2),  # pulled
         ([0.3, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0),  # shutting needs no turned knob
@@ -234,11 +228,8 @@ def test_latch_violation_of_a_planned_motion_is_reported(door_plan: vkc.Plan) ->
         ([0.1, 0.3, 0.3], [0.0, 0.0, 0.0], 0.0),  # ajar: the bolt is out of the lock
         ([0.04, 0.3, 0.3], [0.2, 0.2, 0.2], 0.3),  # ajar, but within the latch's reach
         ([0.04, 0.04, 0.3], [0.0, 0.6, 0.6], 0.0),  # the door may rest ajar until the knob turns
-        (
-            [0.0, 0.04, 0.3],
-            [0.7, 0.5, 0.7],
-            0.0,
-        ),  # released within reach, although the knob turns back
+        # Released within reach, although the knob turns back
+        ([0.0, 0.04, 0.3], [0.7, 0.5, 0.7], 0.0),
     ],
 )
 def test_latch_releases_the_hinge_only_with_the_knob_turned(
@@ -296,10 +287,8 @@ def test_joints_must_not_move_without_a_grasp(door_plan: vkc.Plan) -> None:
     report = check(door_plan, trajectory=replace(door_plan.trajectory, phases=released))
     unheld = {found.subject: found for found in report.violations if found.constraint == "unheld"}
     assert set(unheld) == {"door.hinge", "door.knob"}
-    assert {found.constraint for found in report.violations} <= {
-        "unheld",
-        "clearance",
-    }  # the hand touches the grasped link
+    # The hand touches the grasped link.
+    assert {found.constraint for found in report.violations} <= {"unheld", "clearance"}
     hinge = door_plan.trajectory.column("door.hinge")
     assert unheld["door.hinge"].amount == pytest.approx(np.abs(hinge).max())
     assert hinge[unheld["door.hinge"].waypoint] == pytest.approx(hinge[np.argmax(np.abs(hinge))])

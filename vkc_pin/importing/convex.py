@@ -73,9 +73,12 @@ _MAX_HULL_POINTS = 1000  # of a part: if it has more, its hull is that of its ex
 _MAX_TRIANGLES = 600  # of a part while its best cut is sought
 _MAX_COARSE_TRIANGLES = 150  # of a part while the most promising cuts are sought
 _PROMISING_PLANES = 8  # number of these cuts
-_FACET_PLANES, _AXIS_PLANES = 10, 7  # candidate cuts: through facets, and across each axis
-# Costs of a merged hull besides its protrusion: of its mean thickness over the two, and of its size
-_VOLUME_COST, _SIZE_COST = 2.0, 0.02
+# Candidate cuts
+_FACET_PLANES = 10  # through facets
+_AXIS_PLANES = 7  # across each axis
+# Costs of a merged hull besides its protrusion
+_VOLUME_COST = 2.0  # of its mean thickness over the two
+_SIZE_COST = 0.02  # of its size
 _MIN_FACET = 0.02  # smallest area of a facet that is a candidate, relative to the part
 # Reduction of volume, relative to the hull, that outweighs a facet of the whole part's area
 _FACET_BONUS = 0.3
@@ -153,7 +156,8 @@ def decompose(
     if most_pieces is not None:
         check_integer(most_pieces, "most_pieces", low=1)
     check_integer(corners, "corners", low=8)
-    error, overhead = check_coordinate(error, "error"), check_number(overhead, "overhead", low=0.0)
+    error = check_coordinate(error, "error")
+    overhead = check_number(overhead, "overhead", low=0.0)
     if error <= 0.0:
         raise InputError(
             "`error` must be positive", field="error", expected="a number above 0 [m]", got=error
@@ -208,30 +212,34 @@ def compute_solid_volume(mesh: trimesh.Trimesh) -> float:
 
 def is_flat(mesh: trimesh.Trimesh) -> bool:
     """Return whether a mesh lies almost in one plane, so that it becomes a plate."""
-    return thicken(mesh.vertices, _FLATNESS)[1]
+    _, was_flat = thicken(mesh.vertices, _FLATNESS)
+    return was_flat
 
 
 def measure_outside(piece: trimesh.Trimesh, points: Floats) -> Floats:
-    """Return the signed distances of points, shape (n, 3), from a convex piece, shape (n,) [m]."""
+    """Return the signed distances of points, shape (n, 3), from a convex piece, shape (n,) [m].
+
+    They are those from the plane of the face that a point is furthest beyond: exact inside, and
+    at most the distance outside.
+    """
     normals = np.asarray(piece.face_normals)
-    return np.asarray(
-        (
-            points @ normals.T - np.einsum("ij,ij->i", normals, np.asarray(piece.triangles)[:, 0])
-        ).max(axis=1)
-    )
+    offsets = np.einsum("ij,ij->i", normals, np.asarray(piece.triangles)[:, 0])
+    distances = points @ normals.T - offsets
+    return np.asarray(distances.max(axis=1))
 
 
 def _make_cache_key(mesh: trimesh.Trimesh, *settings: float | None) -> bytes:
     """Return a key of everything that the pieces of a mesh depend on."""
-    surface = hashlib.sha256(
-        np.asarray(mesh.vertices, float).tobytes() + np.asarray(mesh.faces, np.int64).tobytes()
-    )
+    vertices = np.asarray(mesh.vertices, float).tobytes()
+    faces = np.asarray(mesh.faces, np.int64).tobytes()
+    surface = hashlib.sha256(vertices + faces)
     return json.dumps(("pieces", _VERSION, settings, surface.hexdigest())).encode()
 
 
 def _make_hull(points: Floats) -> trimesh.Trimesh:
     """Return the convex hull of points, or a plate around flat ones."""
-    return compute_hull(thicken(points, _FLATNESS)[0])
+    thickened, _ = thicken(points, _FLATNESS)
+    return compute_hull(thickened)
 
 
 def _measure_pieces(pieces: Sequence[trimesh.Trimesh], mesh: trimesh.Trimesh) -> Pieces:
@@ -273,24 +281,30 @@ def _measure_protrusion(pieces: Sequence[trimesh.Trimesh], mesh: trimesh.Trimesh
     has_area = mesh.area_faces > 0.0
     if not has_area.any():
         return 0.0
-    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)[has_area]
+    vertices = np.asarray(mesh.vertices)
+    faces = np.asarray(mesh.faces)[has_area]
     triangles = make_bvh(MeshPart(vertices, faces))
     triangles.computeLocalAABB()
-    here, request, result = coal.Transform3s(), coal.DistanceRequest(), coal.DistanceResult()
-    point, furthest = coal.Sphere(_POINT_RADIUS), 0.0
-    points, normals = list[Floats](), list[Floats]()
+    origin = coal.Transform3s()
+    request = coal.DistanceRequest()
+    result = coal.DistanceResult()
+    point = coal.Sphere(_POINT_RADIUS)
+    # Of each piece: the middles of its largest triangles, and samples
+    points = list[Floats]()
+    normals = list[Floats]()
     for piece in pieces:
         samples, sampled = trimesh.sample.sample_surface(piece, _SAMPLES, seed=0)
         largest = np.argsort(-piece.area_faces, kind="stable")[:_SAMPLES]
         points += [piece.triangles_center[largest], samples]
         normals += [piece.face_normals[largest], piece.face_normals[sampled]]
     places = np.vstack(points)
-    owners = np.repeat(np.arange(len(points)) // 2, [len(some) for some in points])
+    owners = np.repeat(np.arange(len(points)) // 2, [len(group) for group in points])
     outward = places + _OUTWARD * np.vstack(normals)
     # No point is further from the surface than from the nearest point of it: few are measured.
     known, _ = trimesh.sample.sample_surface(mesh, _BOUNDING_SAMPLES, seed=0)
     bounds, _ = KDTree(np.vstack([vertices[np.unique(faces)], known])).query(places)
     order = np.argsort(-bounds)
+    furthest = 0.0
     for batch in np.split(order, range(_BATCH, len(order), _BATCH)):
         is_covered = np.zeros(len(batch), bool)
         for number, piece in enumerate(pieces):
@@ -301,7 +315,8 @@ def _measure_protrusion(pieces: Sequence[trimesh.Trimesh], mesh: trimesh.Trimesh
                 return furthest
             result.clear()
             place = coal.Transform3s(np.eye(3), places[k])
-            furthest = max(furthest, coal.distance(point, place, triangles, here, request, result))
+            distance = coal.distance(point, place, triangles, origin, request, result)
+            furthest = max(furthest, distance)
     return furthest
 
 
@@ -320,11 +335,12 @@ class _Grid:
         import trimesh
         from scipy import ndimage
 
-        self.pitch, self.low = pitch, mesh.bounds[0] - 1.5 * pitch
+        self.pitch = pitch
+        self.low = mesh.bounds[0] - 1.5 * pitch
         size = np.ceil((mesh.bounds[1] - self.low) / pitch).astype(int) + 2
         self.is_skin = np.zeros(size, bool)
         count = int(min(_SAMPLES_PER_CELL * mesh.area / pitch**2, _MAX_SAMPLES)) + 1
-        samples = trimesh.sample.sample_surface(mesh, count, seed=0)[0]
+        samples, _ = trimesh.sample.sample_surface(mesh, count, seed=0)
         self.points = np.vstack([mesh.vertices, samples])
         self.is_skin[self.find_cells(self.points)] = True
         regions, _ = ndimage.label(~self.is_skin)
@@ -343,8 +359,11 @@ class _Surface:
         from scipy import ndimage
 
         volume = float(np.prod(mesh.extents + 0.1 * mesh.extents.max()))
-        self._grid = _Grid(mesh, max(error / 3.0, (volume / _MAX_CELLS) ** (1.0 / 3.0)))
-        is_skin, points = self._grid.is_skin, self._grid.points
+        smallest_pitch = (volume / _MAX_CELLS) ** (1.0 / 3.0)
+        self._grid = _Grid(mesh, max(error / 3.0, smallest_pitch))
+        is_skin = self._grid.is_skin
+        points = self._grid.points
+        # Each cell of the skin has a number, and the centre of the points in it.
         numbers = np.cumsum(is_skin.ravel()) - 1
         cells = numbers[np.ravel_multi_index(self._grid.find_cells(points), is_skin.shape)]
         sums = [np.bincount(cells, weights=coordinates) for coordinates in points.T]
@@ -405,17 +424,29 @@ class _Hull:
             hull = ConvexHull(points, qhull_options="QJ Pp")
         found = points[hull.vertices]
         self.outline = _choose_extremes(found)
-        self.volume, self.area = float(hull.volume), float(hull.area)
+        self.volume = float(hull.volume)
+        self.area = float(hull.area)
         self.bounds = np.array([found.min(axis=0), found.max(axis=0)])
         triangles = points[hull.simplices]
-        a, b, c = triangles.transpose(1, 0, 2)
-        areas = np.linalg.norm(np.cross(b - a, c - a), axis=1).cumsum()
-        place = (np.arange(len(_RANDOM)) + _RANDOM[:, 2]) / len(_RANDOM) * areas[-1]
-        a, b, c = triangles[np.searchsorted(areas, place)].transpose(1, 0, 2)
-        u, v = np.sqrt(_RANDOM[:, :1]), _RANDOM[:, 1:2]
-        samples = a + u * (b - a) + u * v * (c - b)
-        large = triangles[np.argsort(-np.diff(areas, prepend=0.0))[: len(_RANDOM)]].mean(axis=1)
-        self.protrusion = surface.measure_protrusion(np.vstack([samples, large]))
+        samples = _sample_triangles(triangles)
+        self.protrusion = surface.measure_protrusion(samples)
+
+
+def _sample_triangles(triangles: Floats) -> Floats:
+    """Return samples on triangles, shape (m, 3, 3), and the middles of the largest, shape (n, 3).
+
+    A sample takes its triangle by area, at even steps with a random offset each. In the triangle
+    a b c, with u² and v uniform in [0, 1], a + u (b - a) + u v (c - b) is uniform.
+    """
+    a, b, c = triangles.transpose(1, 0, 2)
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1).cumsum()
+    steps = (np.arange(len(_RANDOM)) + _RANDOM[:, 2]) / len(_RANDOM) * areas[-1]
+    a, b, c = triangles[np.searchsorted(areas, steps)].transpose(1, 0, 2)
+    u = np.sqrt(_RANDOM[:, :1])
+    v = _RANDOM[:, 1:2]
+    samples = a + u * (b - a) + u * v * (c - b)
+    largest = np.argsort(-np.diff(areas, prepend=0.0))[: len(_RANDOM)]
+    return np.vstack([samples, triangles[largest].mean(axis=1)])
 
 
 def _cut_mesh(mesh: trimesh.Trimesh, most_pieces: int | None, error: float) -> list[Floats]:
@@ -431,23 +462,20 @@ def _cut_mesh(mesh: trimesh.Trimesh, most_pieces: int | None, error: float) -> l
         outline = np.vstack([one.outline, other.outline])
         return _Hull(outline, surface, [*one.parts, *other.parts])
 
-    few, most = (PIECES, _EXTRA * PIECES) if most_pieces is None else (most_pieces, most_pieces)
-
     @cache
     def estimate(one: _Hull, other: _Hull) -> float:
-        starts, ends = (
-            hull.outline[chosen % len(hull.outline)]
-            for hull, chosen in zip((one, other), _MIDPOINTS, strict=True)
-        )
+        first, second = _MIDPOINTS
+        starts = one.outline[first % len(one.outline)]
+        ends = other.outline[second % len(other.outline)]
         return surface.measure_protrusion((starts + ends) / 2.0)
 
-    for limit, least in (
-        (_FREE_SHARE * error, 1),
-        (_MERGE_SHARE * error, few),
-        (error, few),
-        (np.inf, most),
-    ):
-        hulls = _merge_hulls(hulls, unite, estimate, limit, least)
+    few = PIECES if most_pieces is None else most_pieces
+    most = _EXTRA * PIECES if most_pieces is None else most_pieces
+    # Ever larger protrusions are allowed, down to ever larger numbers of pieces.
+    hulls = _merge_hulls(hulls, unite, estimate, _FREE_SHARE * error, 1)
+    hulls = _merge_hulls(hulls, unite, estimate, _MERGE_SHARE * error, few)
+    hulls = _merge_hulls(hulls, unite, estimate, error, few)
+    hulls = _merge_hulls(hulls, unite, estimate, np.inf, most)
     return [np.vstack(hull.parts) for hull in hulls]
 
 
@@ -455,18 +483,24 @@ def _cut_surface(mesh: trimesh.Trimesh, surface: _Surface, limit: float) -> list
     """Cut a mesh into parts that protrude by at most `limit` [m], or into `_MAX_PARTS`."""
     import trimesh
 
-    vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
+    vertices = np.asarray(mesh.vertices, float)
+    faces = np.asarray(mesh.faces)
     labels = trimesh.graph.connected_component_labels(mesh.face_adjacency, len(faces))
-    bodies = range(labels.max() + 1)
-    groups = [faces[labels == k] for k in bodies] if len(bodies) <= _MAX_PARTS // 2 else [faces]
-    numbers, finished = itertools.count(), list[_Hull]()
+    body_count = labels.max() + 1
+    groups = [faces]
+    if body_count <= _MAX_PARTS // 2:
+        groups = [faces[labels == k] for k in range(body_count)]
+    finished = list[_Hull]()
+    # The part that protrudes most comes first; of equal ones, the first that was added.
+    numbers = itertools.count()
     queue = list[tuple[float, int, _Hull, Floats, Ints]]()
 
     def add_part(vertices: Floats, faces: Ints) -> None:
         used, renumbered = np.unique(faces, return_inverse=True)
-        hull = _Hull(vertices[used], surface)
-        part = vertices[used], renumbered.reshape(-1, 3)
-        heapq.heappush(queue, (-hull.protrusion, next(numbers), hull, *part))
+        own_vertices = vertices[used]
+        own_faces = renumbered.reshape(-1, 3)
+        hull = _Hull(own_vertices, surface)
+        heapq.heappush(queue, (-hull.protrusion, next(numbers), hull, own_vertices, own_faces))
 
     for group in groups:
         add_part(vertices, group)
@@ -509,10 +543,10 @@ def _clip(
     parts = [(vertices, faces[in_plane])]
     others = faces[~in_plane]
     for sign in (-1.0, 1.0):
-        cut = trimesh.intersections.slice_faces_plane(
+        part_vertices, part_faces, *_ = trimesh.intersections.slice_faces_plane(
             vertices, others, sign * normal, offset * normal, cached_dots=sign * heights
         )
-        parts.append((cut[0], cut[1]))
+        parts.append((part_vertices, part_faces))
     return [part for part in parts if len(part[1])]
 
 
@@ -550,18 +584,25 @@ def _rate_planes(
     It is -inf for planes that leave the part whole.
     """
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    edges = edges[find_unique_rows(edges)[0]]
-    flatness = _FLATNESS if thicken(vertices, _FLATNESS)[1] else 0.0
+    first, _ = find_unique_rows(edges)
+    edges = edges[first]
+    _, is_flat_part = thicken(vertices, _FLATNESS)
+    flatness = _FLATNESS if is_flat_part else 0.0
     whole = _compute_hull_volume(vertices, flatness)
     values = np.full(len(planes), -np.inf)
     for number, (normal, offset, bonus) in enumerate(planes):
         heights = _measure_heights(vertices, normal, offset)
         ends = heights[edges]
-        across = (ends.min(axis=1) < 0.0) & (ends.max(axis=1) > 0.0)
-        share = (ends[across, 0] / (ends[across, 0] - ends[across, 1]))[:, None]
-        start, end = vertices[edges[across]].transpose(1, 0, 2)
-        crossings = start + share * (end - start)
-        volumes, sides = 0.0, int((heights[faces] == 0.0).all(axis=1).any())
+        is_across = (ends.min(axis=1) < 0.0) & (ends.max(axis=1) > 0.0)
+        # An edge from p to p' crosses the plane at p + h / (h - h') (p' - p), with the heights h
+        # and h' of its ends.
+        start_height, end_height = ends[is_across].T
+        fraction = (start_height / (start_height - end_height))[:, None]
+        start, end = vertices[edges[is_across]].transpose(1, 0, 2)
+        crossings = start + fraction * (end - start)
+        has_faces_in_plane = bool((heights[faces] == 0.0).all(axis=1).any())
+        sides = int(has_faces_in_plane)
+        volumes = 0.0
         for above in (-heights, heights):
             used = np.zeros(len(vertices), bool)
             used[faces[(above[faces] > 0.0).any(axis=1)]] = True
@@ -579,8 +620,10 @@ def _list_planes(vertices: Floats, faces: Ints) -> Iterator[tuple[Floats, float,
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = np.linalg.norm(normals, axis=1)
     has_area = areas > 0.0
-    corners, areas = corners[has_area], areas[has_area]
+    corners = corners[has_area]
+    areas = areas[has_area]
     normals = normals[has_area] / areas[:, None]
+    # Opposite normals mean the same plane.
     largest = np.abs(normals).argmax(axis=1)
     normals *= np.sign(normals[np.arange(len(normals)), largest])[:, None]
     offsets = np.einsum("ij,ij->i", normals, corners[:, 0])
@@ -591,12 +634,15 @@ def _list_planes(vertices: Floats, faces: Ints) -> Iterator[tuple[Floats, float,
     sums = [np.bincount(group, areas * column) for column in planes.T]
     means = np.asarray(np.column_stack(sums), float)
     means = means / np.linalg.norm(means[:, :3], axis=1, keepdims=True)
+    total_area = areas.sum()
     for k in np.argsort(-facets, kind="stable")[:_FACET_PLANES]:
-        if facets[k] > _MIN_FACET * areas.sum():
-            yield means[k, :3], float(means[k, 3]), _FACET_BONUS * float(facets[k] / areas.sum())
-    for axis in np.vstack([np.eye(3), np.linalg.eigh(np.cov(vertices.T))[1].T]):
+        if facets[k] > _MIN_FACET * total_area:
+            yield means[k, :3], float(means[k, 3]), _FACET_BONUS * float(facets[k] / total_area)
+    _, principal_axes = np.linalg.eigh(np.cov(vertices.T))
+    for axis in np.vstack([np.eye(3), principal_axes.T]):
         along = vertices @ axis
-        low, high = along.min(), along.max()
+        low = along.min()
+        high = along.max()
         for place in np.linspace(low, high, _AXIS_PLANES + 2)[1:-1]:
             rank = (high - low) / extent - 3.0 * abs(place - (low + high) / 2.0) / extent
             yield axis, float(place), 0.01 * float(rank)
@@ -616,13 +662,14 @@ def _coarsen(vertices: Floats, faces: Ints, most: int) -> tuple[Floats, Ints]:
     found, has_area = trimesh.triangles.normals(vertices[faces])
     normals[has_area] = found
     corners = faces.ravel()
-    counts, *sums = (
-        np.bincount(corners, weights, minlength=len(vertices))
-        for weights in (None, *np.repeat(normals, 3, axis=0).T)
-    )
-    total = np.column_stack(sums)
-    order = np.argsort(np.linalg.norm(total, axis=1) / np.maximum(counts, 1), kind="stable")
-    cell, kept = float(np.ptp(vertices, axis=0).max()) / 64.0, faces
+    counts = np.bincount(corners, minlength=len(vertices))
+    corner_normals = np.repeat(normals, 3, axis=0)
+    sums = [np.bincount(corners, column, minlength=len(vertices)) for column in corner_normals.T]
+    # The mean of unit normals around a vertex is the shorter, the sharper the corner is.
+    means = np.linalg.norm(np.column_stack(sums), axis=1) / np.maximum(counts, 1)
+    order = np.argsort(means, kind="stable")
+    cell = float(np.ptp(vertices, axis=0).max()) / 64.0
+    kept = faces
     while len(kept) > most:
         cells = np.floor(vertices[order] / cell).astype(np.int64)
         first, group = find_unique_rows(cells)
@@ -636,7 +683,8 @@ def _coarsen(vertices: Floats, faces: Ints, most: int) -> tuple[Floats, Ints]:
         # A strip narrower than a cell becomes a line.
         is_line = (low < high) & ~is_in_triangle[kept].all(axis=1)
         kept = kept[is_triangle | is_line]
-        kept = kept[find_unique_rows(kept)[0]]
+        distinct, _ = find_unique_rows(kept)
+        kept = kept[distinct]
         cell *= 1.4
     used, kept = np.unique(kept, return_inverse=True)
     return vertices[used], kept.reshape(-1, 3)
@@ -650,9 +698,11 @@ def _compute_hull_volume(points: Floats, flatness: float = 0.0) -> float:
     from scipy.spatial import ConvexHull, QhullError
 
     if len(points) and flatness:
-        points = thicken(points, flatness)[0]
+        points, _ = thicken(points, flatness)
+    if len(points) <= 3:
+        return 0.0
     try:
-        return float(ConvexHull(points).volume) if len(points) > 3 else 0.0
+        return float(ConvexHull(points).volume)
     except QhullError:
         return 0.0
 
@@ -703,8 +753,9 @@ def _merge_hulls(
             add_pair(i, j, unite(left[i], left[j]))
             continue
         del left[i], left[j]
-        left[k := next(numbers)] = union
-        for other in left:
-            if other != k:
-                add_pair(other, k)
+        number = next(numbers)
+        others = list(left)
+        left[number] = union
+        for other in others:
+            add_pair(other, number)
     return list(left.values())

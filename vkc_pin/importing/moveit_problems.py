@@ -104,7 +104,7 @@ def list_problems(folder: str | Path) -> dict[str, tuple[Path, Path]]:
     Raises:
         InputError: There are none, or a request has no scene beside it.
     """
-    found = {}
+    found = dict[str, tuple[Path, Path]]()
     for request in sorted(Path(folder).rglob("request*.yaml")):
         match = _REQUEST.fullmatch(request.name)
         if match is None:
@@ -115,7 +115,7 @@ def list_problems(folder: str | Path) -> dict[str, tuple[Path, Path]]:
                 "there is no scene for this request", file=request, expected=scene.name
             )
         name = request.relative_to(folder).with_name(match[1]).as_posix()
-        found[name] = scene, request
+        found[name] = (scene, request)
     if not found:
         expected = "files scene0001.yaml and request0001.yaml"
         raise InputError("there are no problems in this folder", file=folder, expected=expected)
@@ -148,74 +148,94 @@ def read_problem(
     empty = Scene.from_document(document, ".")
     state = asked.start_state.joint_state
     if len(state.name) != len(state.position):
-        expected, got = f"{len(state.name)} positions", len(state.position)
-        field = "start_state.joint_state"
-        raise InputError("wrong number", file=request, field=field, expected=expected, got=got)
+        raise InputError(
+            "wrong number",
+            file=request,
+            field="start_state.joint_state",
+            expected=f"{len(state.name)} positions",
+            got=len(state.position),
+        )
     values = dict(zip(state.name, state.position, strict=True))
     arm = empty.robot.coordinates.names[3:]
     start = {name: values[name] for name in arm if name in values}
-    standing = empty.with_start(arm=start)
-    obstacles = [
-        entry
-        for each in world.collision_objects
-        for entry in _convert(each, _find_frame(standing, each, scene), scene)
-    ]
+    # Objects may be in the frame of a link of the robot at its start.
+    at_start = empty.with_start(arm=start)
+    obstacles = list[dict[str, Any]]()
+    for item in world.collision_objects:
+        frame = _find_frame(at_start, item, scene)
+        obstacles += _convert(item, frame, scene)
     placed = Scene.from_document({**document, "obstacles": obstacles}, ".").with_start(arm=start)
     return Problem(placed, _read_goal(asked, Path(request)))
 
 
-def _find_frame(scene: Scene, each: _Object, file: str | Path) -> pin.SE3:
+def _find_frame(scene: Scene, item: _Object, file: str | Path) -> pin.SE3:
     """Return the placement of the frame of an object in the world."""
-    name, model = each.header.frame_id, scene.robot.model
+    name = item.header.frame_id
+    model = scene.robot.model
     if name in ("", "world", "map"):
         return pin.SE3.Identity()
     names = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
     if name not in names:
-        raise UnknownNameError("frame", name, names, file=file, field=each.id)
+        raise UnknownNameError("frame", name, names, file=file, field=item.id)
     data = model.createData()
     pin.framesForwardKinematics(model, data, scene.robot.coordinates.q(scene.start[None])[0])
     return data.oMf[model.getFrameId(name, pin.FrameType.BODY)]
 
 
-def _convert(each: _Object, frame: pin.SE3, file: str | Path) -> list[dict[str, Any]]:
+def _convert(item: _Object, frame: pin.SE3, file: str | Path) -> list[dict[str, Any]]:
     """Return an object of a planning scene as obstacles of a scene file."""
-    field = f"world.collision_objects: {each.id}"
-    if each.meshes or each.planes:
+    field = f"world.collision_objects: {item.id}"
+    if item.meshes or item.planes:
         expected = "boxes, cylinders and spheres"
         raise InputError("shapes are not supported", file=file, field=field, expected=expected)
-    if len(each.primitives) != len(each.primitive_poses):
-        expected, got = f"{len(each.primitives)} poses", len(each.primitive_poses)
-        raise InputError("wrong number", file=file, field=field, expected=expected, got=got)
-    found = []
-    for number, (shape, pose) in enumerate(zip(each.primitives, each.primitive_poses, strict=True)):
+    if len(item.primitives) != len(item.primitive_poses):
+        raise InputError(
+            "wrong number",
+            file=file,
+            field=field,
+            expected=f"{len(item.primitives)} poses",
+            got=len(item.primitive_poses),
+        )
+    entries = list[dict[str, Any]]()
+    for number, shape in enumerate(item.primitives):
         if len(shape.dimensions) != _FIELDS[shape.type]:
-            expected, got = f"{_FIELDS[shape.type]} dimensions", len(shape.dimensions)
-            raise InputError("wrong number", file=file, field=field, expected=expected, got=got)
+            raise InputError(
+                "wrong number",
+                file=file,
+                field=field,
+                expected=f"{_FIELDS[shape.type]} dimensions",
+                got=len(shape.dimensions),
+            )
+        pose = item.primitive_poses[number]
         x, y, z, w = pose.orientation
-        place = pin.SE3(pin.Quaternion(w, x, y, z).normalized(), np.array(pose.position))
+        rotation = pin.Quaternion(w, x, y, z).normalized()
+        placement = frame * pin.SE3(rotation, np.array(pose.position))
         entry: dict[str, Any] = {
-            "name": each.id if number == 0 else f"{each.id}_{number}",
+            "name": item.id if number == 0 else f"{item.id}_{number}",
             "type": shape.type,
-            "position": (frame * place).translation.tolist(),
-            "quaternion": pin.Quaternion((frame * place).rotation).coeffs().tolist(),
+            "position": placement.translation.tolist(),
+            "quaternion": pin.Quaternion(placement.rotation).coeffs().tolist(),
         }
         if shape.type == "box":
             entry["size"] = list(shape.dimensions)
-        elif shape.type == "cylinder":  # shape_msgs/SolidPrimitive: height first
+        elif shape.type == "cylinder":
+            # The height comes first, as shape_msgs/SolidPrimitive says.
             entry["length"], entry["radius"] = shape.dimensions
         else:
             (entry["radius"],) = shape.dimensions
-        found.append(entry)
-    return found
+        entries.append(entry)
+    return entries
 
 
 def _read_goal(request: _Request, file: Path) -> dict[str, float]:
     """Return the first goal of a request."""
-    goal = next(iter(request.goal_constraints), None)
-    is_joints = goal is not None and goal.joint_constraints
-    if goal is None or not is_joints or goal.position_constraints or goal.orientation_constraints:
-        expected = "joint_constraints alone"
+    goal = request.goal_constraints[0] if request.goal_constraints else _Goal()
+    has_other_goals = bool(goal.position_constraints or goal.orientation_constraints)
+    if not goal.joint_constraints or has_other_goals:
         raise InputError(
-            "no goal in joint space", file=file, field="goal_constraints", expected=expected
+            "no goal in joint space",
+            file=file,
+            field="goal_constraints",
+            expected="joint_constraints alone",
         )
     return {each.joint_name: each.position for each in goal.joint_constraints}

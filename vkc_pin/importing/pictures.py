@@ -1,4 +1,4 @@
-"""Draws imported robots and objects, so that what was proposed can be seen."""
+"""Draws imported robots and objects, with the proposed attachments and the tool frame."""
 
 from __future__ import annotations
 
@@ -37,8 +37,10 @@ _OPEN = 0.35  # opening of the drawn joint, relative to how far it opens
 _LIGHT = np.array([0.35, -0.5, 0.8]) / np.linalg.norm([0.35, -0.5, 0.8])
 _STATIC_COLOUR = np.array([0.83, 0.83, 0.81])
 _MOVING_COLOUR = np.array([0.93, 0.80, 0.62])
-_HELD_COLOUR = np.array([0.82, 0.29, 0.36])
-_SHORT, _LONG = 0.08, 0.25  # [m] lengths of the tool's axes in the close-up and beside the robot
+_PLACE_COLOUR = np.array([0.82, 0.29, 0.36])
+# Lengths of the tool's axes [m]
+_SHORT = 0.08  # in the close-up
+_LONG = 0.25  # beside the robot
 _AXES = (("x closes", "#d1282e"), ("y", "#2a9d4f"), ("z approaches", "#2f6db5"))
 _TOUCH_COLOUR = np.array([0.93, 0.72, 0.45])
 _LINK_COLOURS = (np.array([0.80, 0.82, 0.84]), np.array([0.66, 0.71, 0.76]))
@@ -78,7 +80,7 @@ def plot_attachments(proposals: Proposals, path: str | Path | None = None) -> Fi
             words.text(0.02, 1.0, "\n".join(lines), va="top", **style)
         for number, proposal in enumerate(drawn):
             axes: Any = pictures.add_subplot(rows, columns, number + 1, projection="3d")
-            joint = list(proposal.opens)[-1]
+            *_, joint = proposal.opens
             _draw(axes, proposals, proposal, joint)
             opened = ", ".join(f"{name} to {value:.2g}" for name, value in proposal.opens.items())
             axes.set_title(
@@ -87,18 +89,17 @@ def plot_attachments(proposals: Proposals, path: str | Path | None = None) -> Fi
         if fails:
             whole: Any = pictures.add_subplot(rows, columns, panels, projection="3d")
             _draw_closed(whole, proposals)
+        title = f"{proposals.object.name}, hand of {proposals.hand.robot}"
         more = len(proposals.found) - len(drawn)
-        pictures.suptitle(
-            f"{proposals.object.name}, hand of {proposals.hand.robot}"
-            + (f" ({more} more)" if more else ""),
-            fontsize=10,
-        )
+        if more:
+            title += f" ({more} more)"
+        pictures.suptitle(title, fontsize=10)
     return save_figure(figure, path)
 
 
 def _format_reasons(proposals: Proposals, letters: int) -> list[str]:
     """Return lines about the joints that no hand can open; joints of one reason are together."""
-    joints_by_reason: dict[str, list[str]] = {}
+    joints_by_reason = dict[str, list[str]]()
     for joint, reason in proposals.because.items():
         joints_by_reason.setdefault(reason, []).append(joint)
     if not joints_by_reason:
@@ -115,18 +116,19 @@ def _draw_closed(axes: Any, proposals: Proposals) -> None:
     state = np.clip(np.zeros(len(item.lower)), item.lower, item.upper)
     triangles = Triangles()
     _add_object(triangles, item, state, item.links_moved_by(set(proposals.because)))
-    places = [place for tried in proposals.rejected.values() for place in tried]
-    step = max(1, len(places) // _PLACES)
-    if chosen := places[::step]:
+    places = list[pin.SE3]()
+    for tried in proposals.rejected.values():
+        places += tried
+    direction = np.array([-1.0, 0.0, 0.0])
+    if places:
+        chosen = places[:: max(1, len(places) // _PLACES)]
         points = np.array([place.translation for place in chosen])
         back = -np.array([place.rotation[:, 2] for place in chosen])
-        axes.quiver(
-            *(points + _ARROW * back).T, *(-_ARROW * back).T, color=_HELD_COLOUR, linewidth=0.8
-        )
-        axes.scatter(*points.T, color=[_HELD_COLOUR], s=6, depthshade=False)
+        starts = points + _ARROW * back
+        arrows = -_ARROW * back
+        axes.quiver(*starts.T, *arrows.T, color=_PLACE_COLOUR, linewidth=0.8)
+        axes.scatter(*points.T, color=[_PLACE_COLOUR], s=6, depthshade=False)
         direction = back.mean(axis=0)
-    else:
-        direction = np.array([-1.0, 0.0, 0.0])
     triangles.draw(axes, direction, ticks=True)
     count = f", {len(places)} places tried" if places else ""
     axes.set_title(f"closed{count} [m]", fontsize=_FONT)
@@ -134,7 +136,8 @@ def _draw_closed(axes: Any, proposals: Proposals) -> None:
 
 def _draw(axes: Any, proposals: Proposals, proposal: Proposal, joint: str) -> None:
     """Draw the object with the hand at one attachment."""
-    item, attachment = proposals.object, proposal.attachment
+    item = proposals.object
+    attachment = proposal.attachment
     state = np.clip(np.zeros(len(item.lower)), item.lower, item.upper)
     for name, value in proposal.when.items():
         state[item.coordinates.index(name)] = value
@@ -142,10 +145,10 @@ def _draw(axes: Any, proposals: Proposals, proposal: Proposal, joint: str) -> No
     state[index] += _OPEN * (proposal.opens[joint] - state[index])
     triangles = Triangles()
     _add_object(triangles, item, state, item.links_moved_by({joint}))
-    tool = item.link_placement(attachment.link, state) * attachment.tool(
-        np.zeros(len(attachment.freedoms))
-    )
-    if attachment.contact == "push":  # the foremost point of the hand is there
+    in_link = attachment.tool(np.zeros(len(attachment.freedoms)))
+    tool = item.link_placement(attachment.link, state) * in_link
+    if attachment.contact == "push":
+        # It is the frame of the hand's foremost point.
         tool = tool * pin.SE3(np.eye(3), np.array([0.0, 0.0, -proposals.hand.tip]))
     for geometry, where in (*proposals.hand.touch, *proposals.hand.others):
         triangles.add(geometry, tool * where, to_rgb(COLOURS[0]))
@@ -167,15 +170,17 @@ class Triangles:
     """Shaded triangles of shapes, to be drawn into axes in three dimensions."""
 
     def __init__(self) -> None:
-        self._faces, self._colours = list[Floats](), list[Floats]()
+        self._faces = list[Floats]()
+        self._colours = list[Floats]()
 
     def add(self, geometry: coal.CollisionGeometry, where: pin.SE3, base: Floats) -> None:
         """Add a shape with a colour, shape (3,)."""
         import trimesh
 
         vertices, corners = triangulate(geometry)
+        size = float(np.ptp(vertices, axis=0).max())
         # matplotlib would draw large triangles in the wrong order.
-        if (size := float(np.ptp(vertices, axis=0).max())) > _FACET:
+        if size > _FACET:
             vertices, corners = trimesh.remesh.subdivide_to_size(
                 vertices, corners, max(_FACET, size / 12.0), max_iter=20
             )
@@ -199,17 +204,20 @@ class Triangles:
         # The module has no type annotations.
         collection = importlib.import_module("mpl_toolkits.mplot3d.art3d").Poly3DCollection
 
-        triangles, shades = np.concatenate(self._faces), np.concatenate(self._colours)
+        triangles = np.concatenate(self._faces)
+        shades = np.concatenate(self._colours)
         axes.add_collection3d(
             collection(triangles, facecolors=shades, edgecolors="none", shade=False)
         )
         points = triangles.reshape(-1, 3)
-        low, high = points.min(axis=0), points.max(axis=0)
-        middle, half = (low + high) / 2.0, float((high - low).max()) / 2.0
-        for set_limits, centre in zip(
-            (axes.set_xlim, axes.set_ylim, axes.set_zlim), middle, strict=True
-        ):
-            set_limits(centre - half, centre + half)
+        low = points.min(axis=0)
+        high = points.max(axis=0)
+        # A cube, so that lengths along all axes look alike
+        x, y, z = (low + high) / 2.0
+        half = float((high - low).max()) / 2.0
+        axes.set_xlim(x - half, x + half)
+        axes.set_ylim(y - half, y + half)
+        axes.set_zlim(z - half, z + half)
         level = float(np.linalg.norm(towards[:2]))
         azimuth = np.degrees(np.arctan2(towards[1], towards[0])) if level > 0.3 else -120.0
         axes.view_init(elev=25.0, azim=azimuth + 40.0)
@@ -243,15 +251,21 @@ def plot_robot(robot: Robot, path: str | Path | None = None) -> Figure:
     data = robot.model.createData()
     q = robot.coordinates.q(np.concatenate([np.zeros(3), robot.home]))
     pin.framesForwardKinematics(robot.model, data, q)
-    tool = data.oMf[robot.model.getFrameId(robot.tool_frame)]
-    wrist = robot.model.frames[robot.model.getFrameId(robot.tool_frame)].parentJoint
-    everything, hand, count = Triangles(), Triangles(), dict[str, int]()
+    frame = robot.model.getFrameId(robot.tool_frame)
+    tool = data.oMf[frame]
+    wrist = robot.model.frames[frame].parentJoint
+    everything = Triangles()
+    hand = Triangles()
+    counts = dict[str, int]()  # of the pieces of a link so far
     for k, shape in enumerate(robot.collision.geometryObjects):
         link = robot.link_of(k)
-        number = count[link] = count.get(link, -1) + 1
+        number = counts.get(link, 0)
+        counts[link] = number + 1
         colour = _TOUCH_COLOUR if link in robot.touch_links else _LINK_COLOURS[number % 2]
-        for triangles in (everything, hand)[: 1 + (shape.parentJoint == wrist)]:
-            triangles.add(shape.geometry, data.oMi[shape.parentJoint] * shape.placement, colour)
+        placement = data.oMi[shape.parentJoint] * shape.placement
+        everything.add(shape.geometry, placement, colour)
+        if shape.parentJoint == wrist:
+            hand.add(shape.geometry, placement, colour)
     with use_style():
         figure = new_figure(9.0, 4.8)
         panels = (
@@ -262,8 +276,8 @@ def plot_robot(robot: Robot, path: str | Path | None = None) -> Figure:
             axes: Any = figure.add_subplot(1, 2, number, projection="3d", computed_zorder=False)
             triangles.draw(axes, np.array([1.0, -1.0, 0.0]), ticks=True)
             for axis, (name, paint) in enumerate(_AXES):
-                ends = tool.translation, tool.translation + length * tool.rotation[:, axis]
-                line = np.array(ends).T
+                end = tool.translation + length * tool.rotation[:, axis]
+                line = np.array([tool.translation, end]).T
                 axes.plot(*line, color=to_rgb(paint), linewidth=2.0, label=name, zorder=10)
             axes.set_title(f"{title} [m]", fontsize=9)
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)

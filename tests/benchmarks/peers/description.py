@@ -112,9 +112,8 @@ def describe(problem: TrajectoryProblem, folder: Path, *, by_body: bool = False)
     group = ET.SubElement(semantics, "group", name=GROUP)
     for name in names:
         ET.SubElement(group, "joint", name=name)
-    ET.SubElement(
-        semantics, "contact_managers_plugin_config", filename=_PLUGINS
-    )  # which tesseract cannot do without
+    # Tesseract cannot do without it.
+    ET.SubElement(semantics, "contact_managers_plugin_config", filename=_PLUGINS)
     for one, other in combinations(links, 2):
         if frozenset((one, other)) not in kept and (
             part.joint[links[one][0]] or part.joint[links[other][0]]

@@ -74,10 +74,9 @@ class Solver:
                 ti.CartPosConstraint(at[k], group, ask["frame"], "world", same, target, f"pose_{k}")
             )
         if ask["goal"]:
-            goal, asked = (
-                seed[-1].copy(),
-                np.full(len(names), 1e-5),
-            )  # 0 is refused; this lets others be anywhere
+            goal = seed[-1].copy()
+            # Weights of 0 are refused; these let the other joints be anywhere.
+            asked = np.full(len(names), 1e-5)
             for name, value in ask["goal"].items():
                 goal[names.index(name)], asked[names.index(name)] = value, 5.0
             constrain(ti.JointPosConstraint(goal, at[-1], asked, "goal"))

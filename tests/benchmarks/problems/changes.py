@@ -125,9 +125,8 @@ def _module(name: str) -> ModuleType:
 
 def _places(module: str, name: str) -> list[tuple[ModuleType, str]]:
     """Return (module, name) of all bindings of a constant."""
-    importlib.import_module(
-        "vkc_pin.planning.planner"
-    )  # and with it all that may import the constant
+    # With it, all is imported that may import the constant.
+    importlib.import_module("vkc_pin.planning.planner")
     home = _module(module)
     found = [(home, name)]
     for other in [

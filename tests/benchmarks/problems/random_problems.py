@@ -48,10 +48,8 @@ _OBSTACLES = 6  # at most
 _SECOND = 0.3  # share of problems of two steps
 _AIR = 1e-3  # [m] below placed objects
 _ROOMS = 100_000  # of one seed
-_LIMITS = {
-    **LIMITS,
-    "max_evaluations": LIMITS["max_evaluations"] // 10,
-}  # many of them cannot be done; those that can take up to 60 000
+# Many tasks are infeasible; the others take up to 60 000 evaluations.
+_LIMITS = {**LIMITS, "max_evaluations": LIMITS["max_evaluations"] // 10}
 OF = ("anything", "rooms")
 
 
@@ -86,9 +84,8 @@ def _room(rng: np.random.Generator) -> Scene:
     count = int(rng.integers(1, 3))
     objects = tuple(str(kind) for kind in rng.choice(list(OPENABLE), count, replace=False))
     carried = tuple(str(kind) for kind in rng.choice(["cup", "ball"], int(rng.integers(1, 3))))
-    clutter = round(
-        float(rng.uniform(0.0, 0.6)), 2
-    )  # much more, and few rooms have a place for everything
+    # With much more, few rooms have a place for everything.
+    clutter = round(float(rng.uniform(0.0, 0.6)), 2)
     return random_room(int(rng.integers(2**31)), clutter=clutter, objects=objects, carried=carried)
 
 
@@ -153,9 +150,8 @@ def _step(scene: Scene, rng: np.random.Generator) -> Step:
 
 def _reach(scene: Scene, rng: np.random.Generator) -> Step:
     x, y = _spot(scene, rng)
-    roll, pitch, yaw = rng.uniform(
-        (np.pi / 2, -np.pi / 4, -np.pi), (np.pi, np.pi / 4, np.pi)
-    )  # level, or downwards
+    # The approach is level, or downwards.
+    roll, pitch, yaw = rng.uniform((np.pi / 2, -np.pi / 4, -np.pi), (np.pi, np.pi / 4, np.pi))
     return Reach((x, y, float(rng.uniform(0.2, 1.4)), roll, pitch, yaw))
 
 

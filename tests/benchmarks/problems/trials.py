@@ -32,9 +32,8 @@ def run_trial(
         solves.extend([row.round] if row.round == 1 else [])
 
     planner = _planner(change)
-    with (
-        change.apply()
-    ):  # before the clock starts: looking for where a constant is imported takes a while
+    # Before the clock starts: looking for where a constant is imported takes a while
+    with change.apply():
         wall, cpu = time.perf_counter(), time.process_time()
         found = plan(
             scene,

@@ -72,20 +72,14 @@ _IT = "it"  # name of the object in its hall
 _SIZE, _HEIGHT = 8.0, 2.4  # inner length of the walls, and their height [m]
 _FRONT = 3.0  # depth of the floor before the object that stays free [m]
 _BEYOND = 2.0  # of floor beyond a wall with a door [m]
-_START: Mapping[str, Any] = {
-    "x": [-2.0, 1.0],
-    "y": [-2.0, 2.0],
-}  # the object is at x = 4 m at most; any heading
-_LOW, _COUNTER = (
-    0.6,
-    0.8,
-)  # [m]: objects below the one stand on a counter of the other height
-_DEPTH, _BESIDE, _MARGIN, _AIR = (
-    0.5,
-    0.2,
-    0.03,
-    0.001,
-)  # [m] of the counter: depth, margins beside, before and behind the object, height
+# [m]; the object is at x = 4 m at most, and any heading is allowed.
+_START: Mapping[str, Any] = {"x": [-2.0, 1.0], "y": [-2.0, 2.0]}
+_LOW = 0.6  # [m] height below which objects stand on a counter
+_COUNTER = 0.8  # [m] height of the counter
+_DEPTH = 0.5  # [m] of the counter
+_BESIDE = 0.2  # [m] of the counter beside the object
+_MARGIN = 0.03  # [m] of the counter before and behind the object
+_AIR = 0.001  # [m] between counter and object
 _OF_KIND = re.compile(r"(?P<kind>[a-z]+)_(?P<seed>\d+)")
 _SAME = 1e-6  # [rad] or [m]
 DEFAULT = "default"

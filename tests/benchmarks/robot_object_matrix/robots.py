@@ -206,9 +206,8 @@ def _row(name: str, own: Sequence[Record]) -> list[str]:
     reached = "–" if first["status"] in _NOT_IMPORTED else f"{good}/{len(own)}"
     times = map(format_decimal, distribution(own, "planning_time"))
     loads = (format_decimal(first[field]) for field in ("import_time", "load_time"))
-    room = (
-        "–" if first["home_room"] is None else f"{1e3 * first['home_room']:.0f}"
-    )  # nothing that could come close
+    # None means that nothing could come close.
+    room = "–" if first["home_room"] is None else f"{1e3 * first['home_room']:.0f}"
     counts = [str(first["joints"]), str(first["pairs"])]
     return [name, first["base"], *counts, *loads, room, reached, *times]
 
@@ -257,9 +256,8 @@ def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:
             imported = import_robot(spec["file"], folder, seed=seed, force=True)
             about["import_time"] = time.process_time() - began
         except InputError as error:
-            because = (
-                str(error).replace(str(Path(spec["file"]).parent), "").lstrip("/")
-            )  # the same wherever packages are
+            # The text is the same wherever packages are.
+            because = str(error).replace(str(Path(spec["file"]).parent), "").lstrip("/")
             return [
                 {
                     **about,

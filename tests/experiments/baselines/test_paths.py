@@ -136,9 +136,10 @@ def test_path_avoids_collisions_of_the_arm() -> None:
     goal = np.array([0.5, 0.6, 0.0])
     base_path = BasePaths(problem).path(START, goal, 80)
     assert base_path is not None
+    # The path is straight below the shelf.
     np.testing.assert_allclose(
         np.diff(base_path[:, 0]) * 0.9 / 2.0, -np.diff(base_path[:, 1]), atol=1e-9
-    )  # straight below the shelf
+    )
     whole_robot = BasePaths(problem, whole=True)
     assert not all(whole_robot.grid.is_pose_free(*pose) for pose in base_path)
     path = whole_robot.path(START, goal, 80)

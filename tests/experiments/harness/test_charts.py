@@ -111,10 +111,8 @@ def test_means_chart_equals_values_computed_by_hand() -> None:
     what = {"field": "base_path_length", "label": "base path length [m]"}
     figure = means_chart([*TRIALS, *unpaired], None, SCENES, ["one", "two"], **what, shared=True)
     (axes,) = figure.axes
-    assert read_bars(axes) == {
-        "easy\n2 trials": [3.5, 5.5],
-        "hard\nown successes": [7.0],
-    }  # 9 and 99 are not shared
+    # The trials with 9 and 99 are not shared.
+    assert read_bars(axes) == {"easy\n2 trials": [3.5, 5.5], "hard\nown successes": [7.0]}
     spread = np.sqrt(0.5)  # of 3 and 4, and of 5 and 6; a single value has none
     assert read_intervals(axes) == [
         pytest.approx([3.5 - spread, 3.5 + spread]),

@@ -280,9 +280,8 @@ def test_stopped_process_keeps_finished_trials(
     process = subprocess.Popen(
         [sys.executable, "-c", SCRIPT, str(tmp_path), str(jobs)],
         start_new_session=True,  # a process group, like that of a command in a terminal
-        preexec_fn=lambda: signal.signal(
-            signal.SIGINT, signal.SIG_DFL
-        ),  # children of background jobs inherit SIG_IGN
+        # Children of background jobs inherit SIG_IGN.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, "PYTHONPATH": path},

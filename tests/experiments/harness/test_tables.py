@@ -72,17 +72,8 @@ def test_methods_table_equals_values_computed_by_hand() -> None:
             "rejected (penetration) 1",
         ],
         ["hard", "auto", "1 of 1", "2.50", "2.50", "7.00", "20.00", "0", "none"],
-        [
-            "hard",
-            "slow",
-            "0 of 3",
-            "20.00",
-            "20.00",
-            "–",
-            "–",
-            "2",
-            "error 1",
-        ],  # an error has no time
+        # An error has no time.
+        ["hard", "slow", "0 of 3", "20.00", "20.00", "–", "–", "2", "error 1"],
         ["all", "auto", "4 of 4", "2.25", "2.92", "4.50", "14.50", "0", "none"],
         [
             "all",

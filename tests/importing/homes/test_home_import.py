@@ -14,9 +14,8 @@ from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import START_CLEARANCE
 
-pytestmark = pytest.mark.filterwarnings(
-    "ignore:.*movable links overlap other shapes"
-)  # cups penetrate their table, as in real homes
+# Cups penetrate their table, as in real homes.
+pytestmark = pytest.mark.filterwarnings("ignore:.*movable links overlap other shapes")
 
 
 @pytest.fixture(scope="module")

@@ -25,9 +25,8 @@ from vkc_pin.importing.proposals.fitting import (
 from vkc_pin.importing.proposals.hand import make_hand
 from vkc_pin.world.models.shapes import compute_clearance
 
-FRONT = np.column_stack(
-    [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
-)  # approaches along x, closes along y
+# Approaches along x, closes along y
+FRONT = np.column_stack([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 
 
 def make_fitting(folder: Path, **shapes: str) -> HandClearance:

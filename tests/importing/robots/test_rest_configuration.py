@@ -46,9 +46,8 @@ def test_home_is_found_by_search(robot: vkc.Robot) -> None:
 
 def test_inseparable_pairs_are_found(tmp_path: Path) -> None:
     robot = vkc.load_robot(write_arms(tmp_path), pairs="all")
-    pairs = find_inseparable_pairs(
-        robot, 0.035, samples=50
-    )  # the first link turns about the vertical, 30 mm above the body
+    # The first link turns about the vertical, 30 mm above the body.
+    pairs = find_inseparable_pairs(robot, 0.035, samples=50)
     assert pairs[("body", "arm_1")] == pytest.approx(0.03)
     assert ("body", "arm_5") not in pairs
     assert ("arm_1", "arm_2") not in pairs

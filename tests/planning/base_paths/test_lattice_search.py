@@ -189,9 +189,8 @@ def test_start_and_goal_may_be_cell_centers() -> None:
 def test_path_may_be_much_longer_than_the_heuristic() -> None:
     """Only exact collision checks find the obstacle on the short path."""
     gate: list[Shape] = [(coal.Box(0.1, 1.4, 1.0), make_pose(0.0, y, 0.5)) for y in (-1.3, 1.3)]
-    lid: list[Shape] = [
-        (coal.Ellipsoid(0.1, 0.6, 0.1), make_pose(0.0, 0.0, 0.3))
-    ]  # ellipsoids block no cells in advance
+    # Ellipsoids block no cells in advance.
+    lid: list[Shape] = [(coal.Ellipsoid(0.1, 0.6, 0.1), make_pose(0.0, 0.0, 0.3))]
     walls: list[Shape] = [(coal.Box(8.0, 0.1, 1.0), make_pose(0.0, y, 0.5)) for y in (-2.0, 2.0)]
     sides = [(coal.Box(0.1, 1.4, 1.0), make_pose(0.0, 4.3, 0.5))]
     grid = BaseGrid(

@@ -218,11 +218,8 @@ CARRIED = [
     (STICK, END),  # two branches of one object
     (STICK, BALL, END, PULLED),
     (END, PUSHED, Hold("cabinet", "ball")),
-    (
-        STICK,
-        PULLED,
-        Hold("cabinet", "sleeve", PULLED, "ball"),
-    ),  # a chain of three, the last with joints
+    # A chain of three, the last with joints.
+    (STICK, PULLED, Hold("cabinet", "sleeve", PULLED, "ball")),
 ]
 
 

@@ -49,9 +49,8 @@ def make_solid(kind: str, rng: np.random.Generator) -> coal.CollisionGeometry:
         "Cone": lambda: coal.Cone(a, b),
         "Ellipsoid": lambda: coal.Ellipsoid(a, b, c),
         "Convex": lambda: make_convex_hull(rng.normal(scale=0.2, size=(12, 3))),
-        "large Convex": lambda: make_convex_hull(
-            rng.normal(scale=0.2, size=(400, 3))
-        ),  # coal uses hill climbing for hulls of this size
+        # coal uses hill climbing for hulls of this size.
+        "large Convex": lambda: make_convex_hull(rng.normal(scale=0.2, size=(400, 3))),
         "TriangleP": lambda: coal.TriangleP(*corners),
         "Halfspace": lambda: coal.Halfspace(sample_normal(rng), a),
         "Plane": lambda: coal.Plane(sample_normal(rng), a),

@@ -42,9 +42,8 @@ def test_installed_packages_contain_their_resources(
     )
     assert find_resource_folder("scenes") == package / "scenes"
     assert list(list_resources("scenes", "*.yaml")) == ["own"]
-    assert (
-        find_resource_folder("robots") == package.parent / "robots"
-    )  # as in a source tree, beside the package
+    # It is beside the package, as in a source tree.
+    assert find_resource_folder("robots") == package.parent / "robots"
 
 
 # Names of new files

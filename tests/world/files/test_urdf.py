@@ -86,11 +86,10 @@ def test_colours_are_shared_by_name(tmp_path: Path) -> None:
 def test_mesh_addresses_are_resolved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Covers given packages, folders above the file, its own folder, and absolute paths."""
     pack = tmp_path / "robots" / "pack"
-    packaged, above, beside = files = (
-        tmp_path / "elsewhere" / "a.stl",
-        pack / "meshes" / "b.stl",
-        pack / "urdf" / "c.stl",
-    )
+    packaged = tmp_path / "elsewhere" / "a.stl"
+    above = pack / "meshes" / "b.stl"
+    beside = pack / "urdf" / "c.stl"
+    files = (packaged, above, beside)
     models = [tmp_path / "robots" / folder / "d.stl" for folder in ("models/bin", "gazebo/tap")]
     names = ("a b.stl", "50%25.stl", "ü#1.stl", "m:n.stl", "%41.stl")
     for file in (*files, *models, *(pack / "urdf" / name for name in names)):

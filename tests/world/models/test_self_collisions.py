@@ -128,9 +128,8 @@ def write_slider(folder: Path, *, gap: float, srdf: str | None = None, at: float
 def test_tight_pairs_have_half_their_distance_as_margin(tmp_path: Path) -> None:
     robot = load_robot(write_slider(tmp_path, gap=0.012, at=0.004))
     assert list(robot.tight) == [("finger", "wall")]
-    assert robot.tight["finger", "wall"] == pytest.approx(
-        0.004, abs=1e-9
-    )  # at home; the maximum would be 16 mm
+    # At home; the maximum would be 16 mm.
+    assert robot.tight["finger", "wall"] == pytest.approx(0.004, abs=1e-9)
     assert robot.own_margin(("finger", "wall"), 0.02) == pytest.approx(0.002, abs=1e-9)
     assert robot.own_margin(("finger", "wall"), 0.001) == 0.001
     assert robot.own_margin(("carriage", "wall"), 0.02) == 0.02

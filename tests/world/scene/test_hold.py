@@ -109,9 +109,8 @@ def test_approach_from_below_the_floor_is_reversed(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match=r"ball\.grip through the object or the floor"):
         scene = make_scene(ball)
     assert scene.objects["ball"].reversed == ("grip",)
-    high = make_scene(
-        {**ball, "position": [1.2, 0.0, 1.0]}
-    )  # where approaches from below are valid
+    # Approaches from below are valid there.
+    high = make_scene({**ball, "position": [1.2, 0.0, 1.0]})
     for other in (high, make_scene(ball, floor=False), make_scene({**ball, "reversed": []})):
         assert other.objects["ball"].reversed == ()
 

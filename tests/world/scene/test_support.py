@@ -68,9 +68,8 @@ def test_stacked_objects_are_supported() -> None:
         "upper": "cup.cup"
     }
     assert find_supported_objects(stacked.objects, {"plate": {"post"}}, ["cup", "upper"]) == {}
-    assert (
-        find_supported_objects(stacked.objects, {"plate": {"plate"}}, ["upper"]) == {}
-    )  # the object between them is held
+    # The object between them is grasped.
+    assert find_supported_objects(stacked.objects, {"plate": {"plate"}}, ["upper"]) == {}
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 0.1, 1.5, 3.0])

@@ -6,6 +6,7 @@ import copy
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from pathlib import PurePosixPath
+from typing import NamedTuple
 
 from vkc_pin.errors import InputError
 from vkc_pin.importing.description import MissingMesh
@@ -29,12 +30,11 @@ def replace_missing_meshes(file: UrdfFile) -> tuple[list[str], list[MissingMesh]
     notes = list[str]()
     lost = list[MissingMesh]()
     replaced = set[str]()  # links that collide with their visual shapes
-    solid = {
-        link.get("name", "")
-        for link in file.root.iter("link")
-        if link.find("collision") is not None
-    }
-    for link, kind, element, mesh, error in _find_missing_meshes(file):
+    solid = set[str]()  # links with collision shapes
+    for link in file.root.iter("link"):
+        if link.find("collision") is not None:
+            solid.add(link.get("name", ""))
+    for link, shape, mesh, kind, error in _find_missing_meshes(file):
         name = link.get("name", "")
         address = mesh.get("filename", "")
         about = f"{name}: there is no {kind} mesh {address}"
@@ -43,13 +43,13 @@ def replace_missing_meshes(file: UrdfFile) -> tuple[list[str], list[MissingMesh]
             mesh.set("filename", other)
             notes.append(f"{about}: {PurePosixPath(other).name} beside it is used")
             continue
-        link.remove(element)
+        link.remove(shape)
         visual = link.findall("visual")
         if kind == "visual" and name in solid:
             notes.append(f"{about}: left out")
         elif kind == "collision" and visual:
             if name not in replaced:
-                link.extend(_make_collision(shape) for shape in visual)
+                link.extend(_make_collision(element) for element in visual)
                 replaced.add(name)
             notes.append(f"{about}: the link's visual shapes collide instead")
         else:
@@ -57,18 +57,26 @@ def replace_missing_meshes(file: UrdfFile) -> tuple[list[str], list[MissingMesh]
     return notes, lost
 
 
-def _find_missing_meshes(
-    file: UrdfFile,
-) -> Iterator[
-    tuple[ElementTree.Element, str, ElementTree.Element, ElementTree.Element, InputError]
-]:
-    """Yield link, kind, shape, mesh and error of each missing mesh."""
+class _Missing(NamedTuple):
+    """A missing mesh: its elements from the link on, the kind of shape, and the error."""
+
+    link: ElementTree.Element
+    shape: ElementTree.Element
+    mesh: ElementTree.Element
+    kind: str
+    error: InputError
+
+
+def _find_missing_meshes(file: UrdfFile) -> Iterator[_Missing]:
     for link in file.root.findall("link"):
         for kind in ("visual", "collision"):
             for element in link.findall(kind):
                 mesh = element.find("geometry/mesh")
-                if mesh is not None and (error := _check_mesh(file, mesh.get("filename", ""))):
-                    yield link, kind, element, mesh, error
+                if mesh is None:
+                    continue
+                error = _check_mesh(file, mesh.get("filename", ""))
+                if error is not None:
+                    yield _Missing(link, element, mesh, kind, error)
 
 
 def _make_collision(visual: ElementTree.Element) -> ElementTree.Element:
@@ -91,5 +99,10 @@ def _find_same_stem(file: UrdfFile, address: str) -> str | None:
     stem, dot, _ = address.rpartition(".")
     if not dot or "/" in address[len(stem) :]:
         stem = address
-    found = (f"{stem}{extension}" for extension in _EXTENSIONS if stem)
-    return next((other for other in found if _check_mesh(file, other) is None), None)
+    if not stem:
+        return None
+    for extension in _EXTENSIONS:
+        other = f"{stem}{extension}"
+        if _check_mesh(file, other) is None:
+            return other
+    return None

@@ -238,7 +238,7 @@ class _Reader:
         code = int(self._model.geom_type[geom])
         name = self._find_shape_name(geom)
         size = tuple(float(value) for value in self._model.geom_size[geom])
-        radius, half_length = size[0], size[1]
+        radius, half_length, _ = size
         triangles = None
         if code == types.mjGEOM_BOX:
             kind = "box"
@@ -304,7 +304,7 @@ class _Reader:
     # Equalities and key frames
 
     def _read_equalities(self) -> tuple[list[Coupling], list[Loop]]:
-        """Return what the equalities that are active at first mean."""
+        """Return the couplings and loops of the equalities that are active at first."""
         model = self._model
         kinds = self._mujoco.mjtEq
         couplings = list[Coupling]()

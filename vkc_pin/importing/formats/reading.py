@@ -50,13 +50,12 @@ def read_description(
         UnknownNameError: The file refers to an unknown name, or does not know an argument.
     """
     path = check_path(file, "file", f"a {FORMATS} file")
-    folders = {
-        name: check_path(value, f"packages['{name}']", "a folder")
-        for name, value in check_mapping(packages or {}, "packages").items()
-    }
-    texts = {
-        name: str(value) for name, value in check_mapping(arguments or {}, "arguments").items()
-    }
+    folders = dict[str, Path]()
+    for name, folder in check_mapping(packages or {}, "packages").items():
+        folders[name] = check_path(folder, f"packages['{name}']", "a folder")
+    texts = dict[str, str]()
+    for name, value in check_mapping(arguments or {}, "arguments").items():
+        texts[name] = str(value)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         description = _read_format(path, folders, texts)

@@ -19,7 +19,7 @@ class HomeContacts:
 
     Attributes:
         allowed: Pairs of links, each sorted.
-        notes: Where they come from, and what was skipped.
+        notes: Their source, and skipped names.
     """
 
     allowed: Collection[tuple[str, str]] = ()

@@ -197,7 +197,7 @@ class _Chooser:
         return 1.0, None
 
     def _compute_motion(self, child: str, value: float) -> pin.SE3:
-        """Return the displacement of what a joint carries, in the root's frame."""
+        """Return the displacement of the links that a joint carries, in the root's frame."""
         at_zero = self._placements[child]
         joint = self.description.joints[child]
         return at_zero * joint.compute_motion(value) * at_zero.inverse()

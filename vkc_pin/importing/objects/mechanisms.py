@@ -10,7 +10,7 @@ from vkc_pin.importing.description import Coupling, Description, Joint, Limits, 
 
 
 def dissolve_mechanisms(description: Description) -> Description:
-    """Return an object whose joints are independent, with notes about what was changed.
+    """Return an object whose joints are independent, with a note about each change.
 
     - A free link that is connected or welded to another link is fixed to it.
     - Other links that are connected or welded close a loop, whose joints are held where they are
@@ -24,10 +24,10 @@ def dissolve_mechanisms(description: Description) -> Description:
         description = _hold_loop(description, loop, held)
     description, moving = _hold_followers(description, held)
     description = _limit_followers(description, moving)
-    joints = {
-        child: joint.fix(held[joint.name]) if joint.name in held else joint
-        for child, joint in description.joints.items()
-    }
+    joints = dict(description.joints)
+    for child, joint in description.joints.items():
+        if joint.name in held:
+            joints[child] = joint.fix(held[joint.name])
     return replace(description, joints=joints, loops=(), couplings=())
 
 
@@ -122,10 +122,9 @@ def _limit_followers(description: Description, couplings: list[Coupling]) -> Des
         if limits is not None and limits != joint.limits:
             note += f", from {limits[0]:g} to {limits[1]:g}, which its leader reaches"
         notes.append(note)
-    joints = {
-        child: replace(joint, limits=limited[joint.name])
-        for child, joint in description.joints.items()
-    }
+    joints = dict[str, Joint]()
+    for child, joint in description.joints.items():
+        joints[child] = replace(joint, limits=limited[joint.name])
     return replace(description.add_notes(*notes), joints=joints)
 
 

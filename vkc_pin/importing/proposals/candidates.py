@@ -121,7 +121,7 @@ def _find_grasp(
     closing = _turn_left(approach)
     near, far = section.extent(approach)
     is_edge = far - near > DEEP
-    # Of an edge, only what lies ahead of the fingertips is between the fingers.
+    # Of an edge, only the part ahead of the fingertips is between the fingers.
     between = section.clip(approach, near + _DEPTH + hand.tip) if is_edge else section
     if between is None or not between.is_graspable(closing):
         return None

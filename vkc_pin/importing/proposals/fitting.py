@@ -273,10 +273,10 @@ class HandClearance:
         arm = coal.Capsule(_ARM_RADIUS, _ARM_LENGTH)
         middle = -(_ARM_START + _ARM_LENGTH / 2.0)
         where = tool * pin.SE3(np.eye(3), np.array([0.0, 0.0, middle]))
-        return any(
-            compute_shape_distance(arm, where, shape.geometry, at) <= 0.0
-            for shape, at in zip(self._shapes, self._at, strict=True)
-        )
+        for shape, at in zip(self._shapes, self._at, strict=True):
+            if compute_shape_distance(arm, where, shape.geometry, at) <= 0.0:
+                return True
+        return False
 
 
 def _transform_box(box: Box, where: pin.SE3) -> Box:

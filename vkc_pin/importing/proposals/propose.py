@@ -154,7 +154,7 @@ class _Search:
     def propose(self) -> list[Proposal]:
         """Return the proposals for all joints.
 
-        Joints that can be opened while all others are closed come first. Parts in the way of other
+        Joints that can be opened while all others are closed come first. Parts that block other
         joints are then opened as far as a hand opens them. Where this ends, a push may go on.
         """
         found = {number: self._propose_in_state(number, {}) for number in self.openings}
@@ -198,7 +198,7 @@ class _Search:
         return is_new
 
     def _find_blockers(self, number: int) -> set[int]:
-        """Return the joints that move links in the way of the hand, without the joint's own."""
+        """Return the joints that move links which block the hand, without the joint's own."""
         supports = self.item.model.supports
         above = set[int]()
         for obstruction in self.tallies[number].blocked:
@@ -214,7 +214,7 @@ class _Search:
     ) -> dict[str, float]:
         """Return positions of joints that are to be opened before, in this order.
 
-        These are the joints in the way that a hand opens, and those that must be open for it.
+        These are the blocking joints that a hand opens, and those that must be open for it.
         """
         own = {self.openings[k].joint for k in self.item.model.supports[number] if k}
         conditions = dict[str, float]()

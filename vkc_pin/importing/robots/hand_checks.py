@@ -188,7 +188,7 @@ class _GraspSearch:
     """Searches configurations that grasp bars of one direction.
 
     At level bars the tool's x axis, in which the fingers close, points upwards, and its y axis is
-    level; at upright bars it is the other way round.
+    level; at upright bars it is the reverse.
 
     Args:
         robot: The robot.

@@ -173,7 +173,9 @@ class _HandAnalysis:
 
     def _find_finger_joints(self, fingers: Sequence[Body]) -> list[str]:
         """Return the joints of fingers, and those of the hand that these follow."""
-        inside = [body for finger in fingers for body in finger.subtree()]
+        inside = list[Body]()
+        for finger in fingers:
+            inside += finger.subtree()
         joints = [body.name for body in inside if body.is_planned]
         of_hand = {body.name for body in self._arm.palm.subtree()[1:] if body.is_planned}
         followers = find_followers(self._file.root)

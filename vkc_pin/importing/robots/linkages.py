@@ -138,11 +138,11 @@ class _Linkage:
         gaps = list[Floats]()
         for loop in self._loops:
             assert loop.points is not None
-            one, other = (
-                self._place_point(link, point, positions)
-                for link, point in zip(loop.links, loop.points, strict=True)
-            )
-            gaps.append(one - other)
+            first_link, second_link = loop.links
+            first_point, second_point = loop.points
+            first = self._place_point(first_link, first_point, positions)
+            second = self._place_point(second_link, second_point, positions)
+            gaps.append(first - second)
         for coupling in self._couplings:
             leader = positions[coupling.leader] if coupling.leader is not None else 0.0
             gaps.append(np.array([positions[coupling.joint] - coupling.evaluate(leader)]))

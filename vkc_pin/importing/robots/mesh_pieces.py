@@ -16,9 +16,9 @@ from vkc_pin.world.files.meshes import load_mesh
 from vkc_pin.world.files.resources import choose_file_names
 from vkc_pin.world.files.urdf import UrdfFile, UrdfShape
 
-# Protrusion of a hull over its mesh that is acceptable on a robot [m], and relative to the longest
-# edge of the mesh, since fingers are small
-_MAX_ERROR, _MAX_RELATIVE_ERROR = 0.02, 0.15
+# Acceptable protrusion of a hull over its mesh on a robot
+_MAX_ERROR = 0.02  # [m]
+_MAX_RELATIVE_ERROR = 0.15  # relative to the longest edge of the mesh, since fingers are small
 _MAX_OVERHEAD = 0.15  # acceptable excess volume of a hull, relative to its mesh
 _MATERIAL = "mtllib "  # statement of an OBJ file that names its material file
 
@@ -58,44 +58,35 @@ def write_meshes(
     root = copy.deepcopy(file.root)
     links = {link.get("name", ""): link for link in root.findall("link")}
     stems = dict(zip(links, choose_file_names(links), strict=True))
-    decompositions, notes = list[Piece](), list[str]()
-    shapes: dict[str, list[UrdfShape]] = {}
+    shapes = dict[str, list[UrdfShape]]()
     for shape in file.read_shapes("collision"):
         shapes.setdefault(shape.link, []).append(shape)
-    done: dict[tuple[Path, tuple[float, ...]], Pieces] = {}  # by mesh file and scale
+    notes = list[str]()
+    decompositions = list[Piece]()
+    done = dict[tuple[Path, tuple[float, ...]], Pieces]()  # by mesh file and scale
     for name, link in links.items():
-        elements = link.findall("collision")
         written = 0
+        elements = link.findall("collision")
         for element, shape in zip(elements, shapes.get(name, []), strict=True):
             if shape.file is None:
                 continue
-            place = list(link).index(element)
-            link.remove(element)
-            key = shape.file, shape.size
+            key = (shape.file, shape.size)
             if key not in done:
-                mesh = load_mesh(shape.file, shape.size)
-                error = min(_MAX_ERROR, _MAX_RELATIVE_ERROR * float(mesh.extents.max()))
-                done[key] = decompose(
-                    mesh, most_pieces=most_pieces, error=error, overhead=_MAX_OVERHEAD
-                )
-                title, protrusion = f"{name}: {shape.file.name}", 1e3 * done[key].error
-                if is_flat(mesh):
-                    thickness = f"{1e3 * SHEET_THICKNESS:g} mm thick"
-                    notes.append(f"{title} is flat: it collides as a plate, {thickness}")
-                if done[key].error > error:
-                    aim = f"(aim: {1e3 * error:.0f} mm)"
-                    notes.append(f"{title}: its pieces protrude by up to {protrusion:.0f} mm {aim}")
+                done[key] = _decompose(name, shape, most_pieces, notes)
             pieces = done[key]
             decompositions.append(
                 Piece(
-                    name,
-                    shape.file.name,
-                    len(pieces.meshes),
-                    pieces.overhead,
-                    pieces.hull_volume / pieces.solid - 1.0,
-                    pieces.error,
+                    link=name,
+                    mesh=shape.file.name,
+                    count=len(pieces.meshes),
+                    overhead=pieces.overhead,
+                    hull=pieces.hull_volume / pieces.solid - 1.0,
+                    error=pieces.error,
                 )
             )
+            # The pieces stand where the mesh was.
+            place = list(link).index(element)
+            link.remove(element)
             for mesh in pieces.meshes:
                 path = folder / "collision" / f"{stems[name]}_{written}.stl"
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -105,9 +96,26 @@ def write_meshes(
                     geometry.attrib.clear()
                     geometry.set("filename", f"collision/{path.name}")
                 link.insert(place, piece)
-                place, written = place + 1, written + 1
+                place += 1
+                written += 1
     _copy_visual(file, links, folder, notes)
     return root, decompositions, notes
+
+
+def _decompose(link: str, shape: UrdfShape, most_pieces: int | None, notes: list[str]) -> Pieces:
+    """Return the convex pieces of a mesh, and note flat meshes and pieces that protrude far."""
+    assert shape.file is not None
+    mesh = load_mesh(shape.file, shape.size)
+    error = min(_MAX_ERROR, _MAX_RELATIVE_ERROR * float(mesh.extents.max()))
+    pieces = decompose(mesh, most_pieces=most_pieces, error=error, overhead=_MAX_OVERHEAD)
+    title = f"{link}: {shape.file.name}"
+    if is_flat(mesh):
+        thickness = f"{1e3 * SHEET_THICKNESS:g} mm thick"
+        notes.append(f"{title} is flat: it collides as a plate, {thickness}")
+    if pieces.error > error:
+        protrusion = f"{1e3 * pieces.error:.0f} mm (aim: {1e3 * error:.0f} mm)"
+        notes.append(f"{title}: its pieces protrude by up to {protrusion}")
+    return pieces
 
 
 def copy_meshes(file: UrdfFile, folder: Path) -> ElementTree.Element:
@@ -118,7 +126,8 @@ def copy_meshes(file: UrdfFile, folder: Path) -> ElementTree.Element:
     Raises:
         InputError: A mesh for collision is missing.
     """
-    root, users = copy.deepcopy(file.root), dict[Path, list[ElementTree.Element]]()
+    root = copy.deepcopy(file.root)
+    users = dict[Path, list[ElementTree.Element]]()  # elements that refer to a mesh file
     for link in root.findall("link"):
         for element in (*link.findall("visual"), *link.findall("collision")):
             mesh = element.find("geometry/mesh")
@@ -139,8 +148,9 @@ def copy_meshes(file: UrdfFile, folder: Path) -> ElementTree.Element:
 def _copy_visual(
     file: UrdfFile, links: dict[str, ElementTree.Element], folder: Path, notes: list[str]
 ) -> None:
-    users: dict[Path, list[ElementTree.Element]] = {}
-    missing = []
+    """Copy the visual meshes of a URDF, and leave out those that cannot be read, with a note."""
+    users = dict[Path, list[ElementTree.Element]]()  # elements that refer to a mesh file
+    missing = list[str]()
     for name, link in links.items():
         for element in link.findall("visual"):
             mesh = element.find("geometry/mesh")
@@ -163,16 +173,18 @@ def _copy_visual(
 
 def _copy_meshes(paths: Sequence[Path], folder: Path) -> dict[Path, str]:
     """Copy meshes and the materials of OBJ files; return the names of the copies."""
-    used = {path: _find_materials(path) for path in paths if path.suffix.lower() == ".obj"}
-    materials = dict.fromkeys(file for files in used.values() for file in files)
-    names = _name_copies([*paths, *materials])
+    materials = {path: _find_materials(path) for path in paths if path.suffix.lower() == ".obj"}
+    files = list(paths)
+    for of_path in materials.values():
+        files += of_path
+    names = _name_copies(list(dict.fromkeys(files)))
     for path, name in names.items():
         folder.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, folder / name)
-    for path, files in used.items():
-        new = {file.name: names[file] for file in files if names[file] != file.name}
-        if new:
-            _rename_materials(folder / names[path], new)
+    for path, of_path in materials.items():
+        renamed = {file.name: names[file] for file in of_path if names[file] != file.name}
+        if renamed:
+            _rename_materials(folder / names[path], renamed)
     return {path: names[path] for path in paths}
 
 
@@ -182,22 +194,29 @@ def _name_copies(paths: Sequence[Path]) -> dict[Path, str]:
     for extension in dict.fromkeys(path.suffix.lower() for path in paths):
         same = [path for path in paths if path.suffix.lower() == extension]
         stems = choose_file_names(path.stem for path in same)
-        names |= {path: f"{stem}{path.suffix}" for path, stem in zip(same, stems, strict=True)}
+        for path, stem in zip(same, stems, strict=True):
+            names[path] = f"{stem}{path.suffix}"
     return names
 
 
 def _find_materials(path: Path) -> list[Path]:
     """Return the material files beside an OBJ file that it names."""
-    named = [path.parent / name for line in _read_lines(path) if (name := _get_material(line))]
-    return [file for file in named if file.is_file() and file.parent == path.parent]
+    found = list[Path]()
+    for line in _read_lines(path):
+        name = _get_material(line)
+        if name:
+            file = path.parent / name
+            if file.is_file() and file.parent == path.parent:
+                found.append(file)
+    return found
 
 
 def _rename_materials(path: Path, names: Mapping[str, str]) -> None:
     """Replace names of material files in an OBJ file."""
-    lines = (
-        f"{_MATERIAL}{names[name]}" if (name := _get_material(line)) in names else line
-        for line in _read_lines(path)
-    )
+    lines = list[str]()
+    for line in _read_lines(path):
+        name = _get_material(line)
+        lines.append(f"{_MATERIAL}{names[name]}" if name in names else line)
     path.write_text("\n".join(lines), encoding="utf-8", errors="surrogateescape")
 
 

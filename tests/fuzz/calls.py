@@ -270,7 +270,7 @@ def _list_calls_of_planning() -> dict[str, partial[Any]]:
             during=None,
         ),
         "Cost": partial(_plan_with_term, vkc.Cost, **term, weight=1.0, during=["go to"]),
-        "Reach": partial(_build, fetch, vkc.Reach, pose=[*point, 0.0, 0.1, 0.2], frame=None),
+        "Reach": partial(_build, fetch, vkc.Reach, pose=(*point, 0.0, 0.1, 0.2), frame=None),
         "Grasp": partial(_build, fetch, vkc.Grasp, object="ball", attachment=None, by=None),
         "Touch": partial(_build, fetch, vkc.Touch, frame="tool0", target=point),
         "Place": partial(_build, fetch, vkc.Place, object="ball", pose=point, attachment=None),

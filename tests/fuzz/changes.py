@@ -11,7 +11,7 @@ from typing import Any
 
 from hypothesis import strategies as st
 
-from .values import DOCUMENTED, TEXTS
+from .values import JSON, TEXTS
 
 MAX_BYTES = 2_000_000
 PLAUSIBLE = st.sampled_from((st.floats(-3.0, 3.0), st.floats(0.0, 0.1))).flatmap(
@@ -110,7 +110,7 @@ def get_at(data: Any, path: tuple[Any, ...]) -> Any:
 
 @st.composite
 def change_data(
-    draw: st.DrawFn, data: Any, values: st.SearchStrategy[Any] = DOCUMENTED, most: int = 3
+    draw: st.DrawFn, data: Any, values: st.SearchStrategy[Any] = JSON, most: int = 3
 ) -> Any:
     """Return a copy of dictionaries and lists with one to `most` changes."""
     data = copy.deepcopy(data)

@@ -77,6 +77,7 @@ PAST_FAILURES: list[tuple[str, dict[str, Any]]] = [
     ("plan", {"perturbation": 1e300}),  # ValueError in validation
     ("plan", {"perturbation": 1e5}),  # no end in validation
     ("plan", {"planner": "x"}),  # AttributeError
+    ("plan", {"time_limit": np.zeros(3)}),  # ValueError
     ("plan", {"progress": nest(5000)}),  # RecursionError
     ("plan", {"steps": [None]}),  # AttributeError
     ("plan_window", {"steps": None}),  # TypeError
@@ -97,7 +98,7 @@ def odd_calls(draw: st.DrawFn) -> tuple[str, dict[str, Any]]:
     changes = {}
     for parameter in draw(chosen):
         argument = valid[parameter]
-        values = VALUES
+        values = VALUES | st.builds(nest, st.just(5000))
         if isinstance(argument, tuple | np.ndarray):
             argument = list(argument)
         if isinstance(argument, dict | list) and argument:

@@ -18,7 +18,7 @@ import vkc_pin as vkc
 from fuzz.bounds import PLANNING_SECONDS, expect_result_or_error, take_share
 from fuzz.calls import SMALL
 from fuzz.changes import change_bytes, change_data, get_at
-from fuzz.values import DOCUMENTED, VALUES
+from fuzz.values import JSON, VALUES
 from vkc_pin.world.files.resources import find_resource_folder
 
 SUFFIXES = (".yaml", ".urdf", ".srdf", ".stl", ".obj", ".ply", ".dae")
@@ -44,8 +44,9 @@ DAE = """<?xml version="1.0"?>
 def copy_resources() -> Path:
     """Copy all robots and scenes, and add a mesh of each format and a scene with these meshes."""
     root = Path(tempfile.mkdtemp())
+    others = shutil.ignore_patterns("recipes")  # of datasets
     for kind in ("robots", "scenes"):
-        shutil.copytree(find_resource_folder(kind), root / kind)
+        shutil.copytree(find_resource_folder(kind), root / kind, ignore=others)
     scenes = root / "scenes"
     box = trimesh.creation.box(extents=(0.5, 0.4, 0.3))
     for kind in ("stl", "obj", "ply"):
@@ -64,8 +65,9 @@ def copy_resources() -> Path:
 @functools.cache
 def list_files() -> list[str]:
     """Return the files of all robots and scenes."""
-    files = [path for path in copy_resources().rglob("*") if path.suffix in SUFFIXES]
-    return sorted(str(path.relative_to(copy_resources())) for path in files)
+    root = copy_resources()
+    files = [path for path in root.rglob("*") if path.suffix in SUFFIXES]
+    return sorted(str(path.relative_to(root)) for path in files)
 
 
 @functools.cache
@@ -89,7 +91,7 @@ def changed_files(draw: st.DrawFn) -> tuple[str, bytes]:
 def changed_documents(draw: st.DrawFn) -> Any:
     """Return a changed description of a scene."""
     name = draw(st.sampled_from(sorted(load_documents())))
-    values = draw(st.sampled_from((DOCUMENTED, DOCUMENTED, DOCUMENTED, VALUES)))
+    values = draw(st.sampled_from((JSON, JSON, JSON, VALUES)))
     return draw(change_data(load_documents()[name], values))
 
 
@@ -112,7 +114,7 @@ def load_scene_of(file: Path) -> vkc.Scene:
     document: dict[str, Any] = {"robot": "husky_ur5e", **ARENA}
     match file.relative_to(copy_resources()).parts[:2]:
         case "robots", _:
-            urdf = file.parent / "husky_ur5e.urdf"
+            urdf = copy_resources() / "robots" / "husky_ur5e" / "husky_ur5e.urdf"
             vkc.load_robot(file if file.suffix in (".yaml", ".urdf") else urdf)
             document["robot"] = "../robots/husky_ur5e/robot.yaml"
         case _, "objects":

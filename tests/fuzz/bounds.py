@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import faulthandler
 import signal
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +19,7 @@ from vkc_pin.errors import VkcError
 MAX_SECONDS = 2.0  # [s] of processor time
 PLANNING_SECONDS = 8.0  # [s] of processor time, for cases that build or solve a problem
 MAX_GROWTH = 500.0  # [MB] of resident memory
-TIMEOUT = 40.0  # [s] of wall-clock time after which a case is interrupted
+TIMEOUT = 40.0  # [s] of wall-clock time after which a case is interrupted; twice ends the process
 MAX_MESSAGE = 4000  # characters
 
 
@@ -37,7 +39,10 @@ def expect_result_or_error(max_seconds: float = MAX_SECONDS) -> Iterator[None]:
     memory = _read_memory("VmRSS")
     start_time = time.process_time()
     previous = signal.signal(signal.SIGALRM, _interrupt)
-    signal.setitimer(signal.ITIMER_REAL, TIMEOUT)
+    # The time limit of the whole test, which pytest-timeout has set, stops while a case runs.
+    remaining, _ = signal.setitimer(signal.ITIMER_REAL, TIMEOUT)
+    # Compiled code is not interrupted by signals.
+    faulthandler.dump_traceback_later(2.0 * TIMEOUT, exit=True, file=sys.__stderr__)
     try:
         yield
     except VkcError as error:
@@ -45,8 +50,10 @@ def expect_result_or_error(max_seconds: float = MAX_SECONDS) -> Iterator[None]:
         assert message.strip(), "an error without a message"
         assert len(message) <= MAX_MESSAGE, f"a message of {len(message)} characters"
     finally:
+        faulthandler.cancel_dump_traceback_later()
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, previous)
+        signal.setitimer(signal.ITIMER_REAL, remaining)
     seconds = time.process_time() - start_time
     growth = _read_memory("VmHWM") - memory
     assert seconds <= max_seconds, f"took {seconds:.1f} s"

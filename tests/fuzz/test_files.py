@@ -21,23 +21,10 @@ from fuzz.changes import change_bytes, change_data, get_at
 from fuzz.values import JSON, VALUES
 from vkc_pin.world.files.resources import find_resource_folder
 
+DAE = Path(__file__).with_name("box.dae")
 SUFFIXES = (".yaml", ".urdf", ".srdf", ".stl", ".obj", ".ply", ".dae")
 ARENA = {"start": {"base": [0, 0, 0]}, "arena": {"x": [-9, 9], "y": [-9, 9]}}
 PLANNED = st.integers(0, 49).map(lambda number: number == 0)  # also plan in the loaded scene
-DAE = """<?xml version="1.0"?>
-<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
-<asset><unit meter="1"/><up_axis>Z_UP</up_axis></asset>
-<library_geometries><geometry id="g"><mesh>
-<source id="p"><float_array id="a" count="12">0 0 0 1 0 0 0 1 0 0 0 1</float_array>
-<technique_common><accessor source="#a" count="4" stride="3"><param name="X" type="float"/>
-<param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common></source>
-<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
-<triangles count="4"><input semantic="VERTEX" source="#v" offset="0"/>
-<p>0 2 1 0 1 3 0 3 2 1 2 3</p></triangles></mesh>
-</geometry></library_geometries><library_visual_scenes><visual_scene id="s">
-<node><instance_geometry url="#g"/></node></visual_scene>
-</library_visual_scenes><scene><instance_visual_scene url="#s"/></scene></COLLADA>
-"""
 
 
 @functools.cache
@@ -51,7 +38,7 @@ def copy_resources() -> Path:
     box = trimesh.creation.box(extents=(0.5, 0.4, 0.3))
     for kind in ("stl", "obj", "ply"):
         box.export(scenes / f"box.{kind}")
-    (scenes / "box.dae").write_text(DAE, encoding="utf-8")
+    shutil.copy(DAE, scenes)
     lines = ["robot: ../robots/husky_ur5e/robot.yaml", "start: {base: [0, 0, 0]}"]
     lines += ["arena: {x: [-9, 9], y: [-9, 9]}", "obstacles:"]
     for k, kind in enumerate(("stl", "obj", "ply", "dae")):

@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 
 from fuzz.bounds import PLANNING_SECONDS, expect_result_or_error, take_share
 from fuzz.changes import change_bytes
-from fuzz.test_files import DAE
 from vkc_pin.importing import import_home, import_object, import_robot
 from vkc_pin.importing.objects.clean_up import rename_for_scenes
 from vkc_pin.importing.objects.object_reading import read_object
 from vkc_pin.importing.robots.sources import read_source
 
 INPUTS = Path(__file__).with_name("inputs")
+DAE = Path(__file__).with_name("box.dae")
 OTHER_XACRO = b'<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><material name="m"/></robot>'
 FILE_NAMES = ("ü", "x\nfree: true\n#", "con", "x" * 240, "-a", " ", "\x1b[2J")
 NAMED = re.compile(r'(?<=name=")[^"]*(?=")')
@@ -38,7 +38,7 @@ def read_inputs() -> dict[str, bytes]:
     """Return name → content of the files to import, and of the files beside them."""
     box = trimesh.creation.box((0.05, 0.05, 0.2))
     meshes = {f"part.{kind}": box.export(file_type=kind) for kind in ("stl", "obj")}
-    files = {"other.xacro": OTHER_XACRO, "part.dae": DAE.encode()}
+    files = {"other.xacro": OTHER_XACRO, "part.dae": DAE.read_bytes()}
     for name, content in meshes.items():
         files[name] = content.encode() if isinstance(content, str) else content
     return files | {path.name: path.read_bytes() for path in sorted(INPUTS.iterdir())}

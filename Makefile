@@ -63,7 +63,7 @@ lint: $(VENV)/test.stamp
 	$(BIN)/zizmor --offline --quiet .github/workflows
 
 clean:
-	rm -rf $(VENV) out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis mutants
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # What a machine must have; says what to install where it has not. Usage: $(call need,shell test,what is missing,packages)

@@ -15,9 +15,10 @@ from hypothesis import settings
 
 import vkc_pin as vkc
 
-# Examples are reproducible; HYPOTHESIS_PROFILE=random generates new ones.
+# Examples are reproducible; HYPOTHESIS_PROFILE=random generates new ones, =long many new ones.
 settings.register_profile("repeatable", derandomize=True)
 settings.register_profile("random", derandomize=False)
+settings.register_profile("long", derandomize=False, max_examples=20_000)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
 
 # Disables background compilation and the cache in the user's home. Tests of the cache set their own

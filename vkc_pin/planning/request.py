@@ -11,7 +11,13 @@ from vkc_pin.options import Options
 from vkc_pin.planning.initialization.methods import INITIALIZATIONS
 from vkc_pin.planning.progress import Progress
 from vkc_pin.planning.solver.solution import Iteration
-from vkc_pin.utils.arguments import check_choice, check_instance, check_integer, check_number
+from vkc_pin.utils.arguments import (
+    check_choice,
+    check_instance,
+    check_integer,
+    check_number,
+    is_number,
+)
 from vkc_pin.utils.budget import Budget
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.scene.scene import Scene
@@ -85,9 +91,10 @@ def make_budget(time_limit: object, max_evaluations: object) -> Budget:
     if time_limit is None:
         time_limit = DEFAULT_TIME_LIMIT if max_evaluations is None else math.inf
     expected = "a time [s], more than 0; inf: no limit"
-    if time_limit != math.inf:
-        time_limit = check_number(time_limit, "time_limit", expected, low=0.0, strict=True)
-    return Budget(None if time_limit == math.inf else float(time_limit), max_evaluations)
+    if is_number(time_limit) and time_limit == math.inf:
+        return Budget(None, max_evaluations)
+    seconds = check_number(time_limit, "time_limit", expected, low=0.0, strict=True)
+    return Budget(seconds, max_evaluations)
 
 
 def check_arguments(scene: object, options: object, seed: object) -> None:

@@ -129,6 +129,26 @@ def test_hinge_and_knob_are_actuated_together() -> None:
     assert (turn.values, turn.ranges) == ({"door.knob": 0.0}, {"door.knob": KNOB})
 
 
+@pytest.mark.parametrize("thresholds", [(0.3, 0.5), (0.5, 0.3)])
+@pytest.mark.parametrize("knob", [None, 0.0, 0.7])
+def test_one_joint_releases_several_latches(
+    thresholds: tuple[float, ...], knob: float | None
+) -> None:
+    """The largest threshold counts while the door moves, and the asked value at the end."""
+    scene = load_door_scene()
+    (latch,) = scene.objects["door"].object.latches
+    latches = tuple(dataclasses.replace(latch, threshold=value) for value in thresholds)
+    scene = replace_object(scene, "door", latches=latches)
+    asked = {"hinge": 1.2} if knob is None else {"hinge": 1.2, "knob": knob}
+    phases = compile_steps([Actuate("door", asked)], scene).phases
+    (move,) = (phase for phase in phases if phase.name.startswith("move"))
+    assert move.values["door.knob"] == max(knob or 0.0, TURNED)
+    assert move.ranges["door.knob"] == (TURNED, KNOB[1])
+    last = phases[-1]
+    expected = {"door.knob": 0.0} if knob == 0.0 else move.values
+    assert last.values == expected
+
+
 def test_reach_has_one_frame_goal() -> None:
     pose = pin.SE3(np.eye(3), np.array([1.0, 0.0, 1.0]))
     (phase,) = compile_steps([Reach(pose)]).phases

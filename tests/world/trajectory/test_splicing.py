@@ -55,6 +55,12 @@ def test_concatenation_pauses_at_new_grasps() -> None:
     assert whole.robot_size == 5
 
 
+def test_concatenation_without_pauses_adds_no_segments() -> None:
+    whole = concatenate_trajectories(make_parts(), pause=0.0)
+    np.testing.assert_allclose(whole.times, [0.0, 1.0, 3.0, 4.0, 4.5])
+    assert [(p.first, p.last) for p in whole.phases] == [(0, 1), (1, 2), (2, 3), (3, 4)]
+
+
 def test_indirect_grasps_pause_too() -> None:
     both = {"stick": "grip", "ball": "pull"}
     holds = make_holds(both, {"ball": "stick.tip"}), make_holds(both), make_holds({"stick": "grip"})

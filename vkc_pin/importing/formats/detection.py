@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from vkc_pin.errors import InputError
+from vkc_pin.importing.formats.xacro import uses_xacro
 from vkc_pin.world.files.documents import read_head, read_text
 from vkc_pin.world.files.xml import parse_xml
 
 _HEAD = 4096  # bytes in which the first element of an XML file begins
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"  # of UTF-8, with which editors of Windows begin files
+_ELEMENTS = {"robot": "URDF", "mujoco": "MJCF", "sdf": "SDF"}
+"""First element of an XML file → its format."""
 _SIGNATURES = {
     b"#usda": "USD",
     b"PXR-USDC": "USD",
@@ -49,29 +51,47 @@ _SUFFIXES = {
 """Suffix of a file that is no XML → its format."""
 
 
-def read_root(file: Path, formats: str) -> tuple[str, ElementTree.Element]:
-    """Return text and root element of an XML file.
+def detect_format(file: Path, formats: Collection[str]) -> str:
+    """Return the format of a file, by its first element or its first bytes.
 
     Args:
         file: The file.
-        formats: The formats that are read, "URDF or MJCF".
+        formats: Names of the formats that are read.
 
     Raises:
-        InputError: The file cannot be read, is not XML, or has another format, which is named.
+        InputError: The file cannot be read, or has another format, which is named if it is known.
     """
-    head = read_head(file, formats, _HEAD).removeprefix(_BYTE_ORDER_MARK).lstrip()
+    readable = list_formats(formats)
+    head = read_head(file, readable, _HEAD).removeprefix(_BYTE_ORDER_MARK).lstrip()
     if head and not head.startswith(b"<"):
         name = _recognise_format(head, file)
+        if name in formats:
+            return str(name)
         if name is not None:
             problem = f"{name} is not supported"
-            expected = f"{formats}: export or convert it to one of these"
+            expected = f"{readable}: export or convert it to one of these"
             raise InputError(problem, file=file, expected=expected)
-    text = read_text(file, formats)
+    text = read_text(file, readable)
     if text.strip() and not text.lstrip().startswith("<"):
-        expected = f"a {formats} file, which begins with an element"
+        expected = f"a {readable} file, which begins with an element"
         first = text.split(maxsplit=1)[0]
         raise InputError("the file is not XML", file=file, expected=expected, got=first[:40])
-    return text, parse_xml(text, file)
+    root = parse_xml(text, file)
+    name = "xacro" if root.tag == "robot" and uses_xacro(root, file) else _ELEMENTS.get(root.tag)
+    if name not in formats:
+        raise InputError(
+            "the file does not describe a robot, an object or a home",
+            file=file,
+            expected="a URDF or xacro (<robot>), MJCF (<mujoco>) or SDF (<sdf>) file",
+            got=f"<{root.tag}>",
+        )
+    return str(name)
+
+
+def list_formats(formats: Collection[str]) -> str:
+    """Return names of formats as part of a sentence."""
+    *first, last = formats
+    return f"{', '.join(first)} or {last}"
 
 
 def _recognise_format(head: bytes, file: Path) -> str | None:

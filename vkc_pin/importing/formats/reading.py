@@ -10,24 +10,40 @@ import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from vkc_pin.errors import InputError
 from vkc_pin.importing.description import Description
-from vkc_pin.importing.formats.detection import check_no_arguments, read_root
+from vkc_pin.importing.formats.detection import (
+    check_no_arguments,
+    detect_format,
+    list_formats,
+)
 from vkc_pin.importing.formats.mjcf import read_mjcf_description
 from vkc_pin.importing.formats.sdf import read_sdf_description
 from vkc_pin.importing.formats.urdf import read_urdf_description
-from vkc_pin.importing.formats.xacro import expand_xacro, uses_xacro
+from vkc_pin.importing.formats.xacro import expand_xacro
 from vkc_pin.utils.arguments import check_mapping
 from vkc_pin.world.files.resources import check_path
 
-FORMATS = "URDF, xacro, MJCF or SDF"
-"""The formats that are read."""
-_READERS: Mapping[str, Callable[[Path, Mapping[str, Path]], Description]] = {
-    "robot": read_urdf_description,
-    "mujoco": lambda file, packages: read_mjcf_description(file),
-    "sdf": read_sdf_description,
+Folders = Mapping[str, Path]
+"""Folders of packages by name."""
+Arguments = Mapping[str, str]
+"""Arguments of a xacro file by name."""
+
+
+def _read_xacro(file: Path, packages: Folders, arguments: Arguments) -> Description:
+    text = expand_xacro(file, packages, arguments)
+    description = read_urdf_description(file, packages, text=text)
+    return dataclasses.replace(description, format="xacro")
+
+
+_READERS: Mapping[str, Callable[[Path, Folders, Arguments], Description]] = {
+    "URDF": lambda file, packages, _: read_urdf_description(file, packages),
+    "xacro": _read_xacro,
+    "MJCF": lambda file, packages, _: read_mjcf_description(file),
+    "SDF": lambda file, packages, _: read_sdf_description(file, packages),
 }
-"""Reader by the first element of a file; it gets the folders of packages by name."""
+"""Reader of each format; `detect_format` names the formats."""
+FORMATS = list_formats(_READERS)
+"""The formats that are read, as part of a sentence."""
 
 
 def read_description(
@@ -36,7 +52,7 @@ def read_description(
     packages: Mapping[str, str | Path] | None = None,
     arguments: Mapping[str, str] | None = None,
 ) -> Description:
-    """Read a URDF, xacro, MJCF or SDF file, whose first element tells its format.
+    """Read a file of one of `FORMATS`, which its first element or its first bytes tell.
 
     Warnings become notes of the description.
 
@@ -58,25 +74,9 @@ def read_description(
         texts[name] = str(value)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        description = _read_format(path, folders, texts)
+        name = detect_format(path, _READERS)
+        if name != "xacro":
+            check_no_arguments(path, texts)
+        description = _READERS[name](path, folders, texts)
     notes = dict.fromkeys(str(warning.message) for warning in caught)
     return description.add_notes(*notes)
-
-
-def _read_format(
-    path: Path, packages: Mapping[str, Path], arguments: Mapping[str, str]
-) -> Description:
-    _, root = read_root(path, FORMATS)
-    if root.tag == "robot" and uses_xacro(root, path):
-        text = expand_xacro(path, packages, arguments)
-        description = read_urdf_description(path, packages, text=text)
-        return dataclasses.replace(description, format="xacro")
-    check_no_arguments(path, arguments)
-    if root.tag not in _READERS:
-        raise InputError(
-            "the file does not describe a robot, an object or a home",
-            file=path,
-            expected="a URDF or xacro (<robot>), MJCF (<mujoco>) or SDF (<sdf>) file",
-            got=f"<{root.tag}>",
-        )
-    return _READERS[root.tag](path, packages)

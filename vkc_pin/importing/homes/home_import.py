@@ -13,6 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
+from vkc_pin.importing.formats.reading import FORMATS
 from vkc_pin.importing.homes.allowed_contacts import read_home_contacts
 from vkc_pin.importing.homes.splitting import FLOOR_RISE, Home, add_floor, split_home
 from vkc_pin.importing.homes.writing import (
@@ -142,7 +143,7 @@ def import_home(  # noqa: PLR0913 - keyword options of a public call
             files; an argument is invalid; or the robot finds no start pose.
         UnknownNameError: The robot is unknown, or the file refers to an undefined name.
     """
-    path = check_path(file, "file", "a URDF, xacro, MJCF or SDF file")
+    path = check_path(file, "file", f"a {FORMATS} file")
     floor = check_number(floor, "floor", "a height [m]", low=-_LARGEST, high=_LARGEST)
     check_integer(most, "most", low=1, high=100)
     rng = np.random.default_rng(check_integer(seed, "seed", low=0))
@@ -150,7 +151,7 @@ def import_home(  # noqa: PLR0913 - keyword options of a public call
     loaded_robot = load_robot(robot)
     name = _choose_name(path)
     target = Path(name) if folder is None else check_path(folder, "folder", "a folder")
-    check_source(path, "a URDF, xacro, MJCF or SDF file")
+    check_source(path, f"a {FORMATS} file")
     check_target(target, _COMMAND, force=check_bool(force, "force"))
     srdf_path = None if srdf is None else check_path(srdf, "srdf")
     original = read_object(path, free=True, packages=packages, arguments=arguments)

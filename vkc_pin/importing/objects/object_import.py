@@ -13,6 +13,7 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError
 from vkc_pin.importing.description import Description
+from vkc_pin.importing.formats.reading import FORMATS
 from vkc_pin.importing.objects.clean_up import (
     compute_bounds,
     find_closed_positions,
@@ -135,7 +136,7 @@ def import_object(  # noqa: PLR0913 - keyword options of a public call
             files, or an argument is invalid.
         UnknownNameError: The link or robot is unknown, or the file refers to an unknown name.
     """
-    path = check_path(file, "file", "a URDF, xacro, MJCF or SDF file")
+    path = check_path(file, "file", f"a {FORMATS} file")
     check_choice(up, ("y", "z"), "vertical axis", "up")
     if link is not None:
         check_text(link, "link", "the name of a link")
@@ -146,7 +147,7 @@ def import_object(  # noqa: PLR0913 - keyword options of a public call
     loaded_robot = robot if isinstance(robot, Robot) else load_robot(robot)
     name = _choose_name(path, link)
     target = Path(name) if folder is None else check_path(folder, "folder", "a folder")
-    check_source(path, "a URDF, xacro, MJCF or SDF file")
+    check_source(path, f"a {FORMATS} file")
     check_target(target, _COMMAND, force=check_bool(force, "force"))
     description = _read_single_object(path, link, packages, arguments)
     description, size = _scale_to_size(make_upright(description, up), height, scale)

@@ -16,6 +16,7 @@ import pinocchio as pin
 import yaml
 
 from vkc_pin.errors import InputError, UnknownNameError
+from vkc_pin.importing.formats.reading import FORMATS
 from vkc_pin.importing.pictures import plot_robot
 from vkc_pin.importing.robots.arms import (
     Arm,
@@ -148,7 +149,7 @@ def import_robot(  # noqa: PLR0913 - keyword options of a public call
             extra `import` is missing.
         UnknownNameError: The arm or frame is unknown; the error names the nearest one.
     """
-    path = check_path(file, "file", "a URDF, xacro, MJCF or SDF file")
+    path = check_path(file, "file", f"a {FORMATS} file")
     (name,) = choose_file_names([path.name.split(".")[0]], fallback="robot")
     target = Path(name) if folder is None else check_path(folder, "folder", "a folder")
     for field, given in (("arm", arm), ("tool_frame", tool_frame)):
@@ -158,7 +159,7 @@ def import_robot(  # noqa: PLR0913 - keyword options of a public call
         check_integer(most_pieces, "most_pieces", low=1, high=1000)
     check_integer(samples, "samples", low=1, high=1_000_000)
     srdf_path = None if srdf is None else check_path(srdf, "srdf")
-    check_source(path, "a URDF, xacro, MJCF or SDF file")
+    check_source(path, f"a {FORMATS} file")
     check_target(target, "import-robot", force=check_bool(force, "force"))
     # `check_target` allowed replacing it
     with write_folder_atomically(target, force=True, source=path) as staging:

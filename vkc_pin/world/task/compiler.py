@@ -316,6 +316,7 @@ class _Compiler:
         hold = self._grasp_at(fit, placed, where)
         ranges = {coordinate: find_joint_limits(placed, coordinate) for coordinate in values}
         path = find_path_joints(placed, placed.object.attachments[hold.attachment])
+        asked = dict(values)
         after: dict[str, float] = {}
         for latch in find_blocking_latches(placed, self.state, values):
             release = f"{step.object}.{latch.released_by}"
@@ -328,13 +329,12 @@ class _Compiler:
                 turn_ranges = {release: (lower, upper)}
                 self._append_motion("turn", hold, where, {release: turned}, turn_ranges)
             # A value below the threshold must wait until the latch has disengaged.
-            if values.get(release, upper) < turned:
-                after[release] = values[release]
-            if release in after:
-                values[release] = turned
-            else:
-                values.setdefault(release, turned)
-            ranges[release] = (turned, upper)
+            if asked.get(release, upper) < turned:
+                after[release] = asked[release]
+            # One joint may release several latches: the largest threshold counts.
+            values[release] = max(values.get(release, turned), turned)
+            lowest, _ = ranges.get(release, (turned, upper))
+            ranges[release] = (max(lowest, turned), upper)
         self._keep_out_of_latches(placed, values, ranges)
         self._append_motion("move", hold, where, values, ranges)
         if after:

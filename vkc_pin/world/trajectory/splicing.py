@@ -42,7 +42,7 @@ def concatenate_trajectories(parts: Sequence[Trajectory], *, pause: float) -> Tr
                 got = f"{largest:g} apart"
                 raise InputError(problem, field=f"parts[{number}]", got=got)
             shift = len(waypoints.times) - 1
-            if _changes_grasp(phases[-1], part.phases[0]):
+            if pause > 0.0 and _changes_grasp(phases[-1], part.phases[0]):
                 # The rest has a segment of its own.
                 shift += 1
                 rest = pause

@@ -58,6 +58,7 @@ Writers = Mapping[str, Callable[[str], object]]
 
 
 def _print_progress(row: Any) -> None:
+    """Print a round of planning."""
     sys.stderr.write(
         f"  round {row.round:2d}  Ipopt {row.iterations:4d}"
         f"  clearance {1e3 * row.clearance:7.1f} mm  shortfall {1e3 * row.shortfall:6.2f} mm"
@@ -72,7 +73,8 @@ def _plan(arguments: argparse.Namespace) -> int:
     steps = make_steps(arguments.steps or ())
     files = _get_given(arguments, "save", "json", "csv", "ros", "html", "rosbag", "plots")
     outputs: dict[str, str] = dict(files)
-    if (folder := files.get("plots")) is not None:
+    folder = files.get("plots")
+    if folder is not None:
         if Path(folder).suffix.lower() in PICTURES:
             raise InputError(
                 "this is the name of a picture", field="--plots", expected="a folder", got=folder
@@ -93,7 +95,10 @@ def _plan(arguments: argparse.Namespace) -> int:
         seed=arguments.seed,
         callback=None if arguments.quiet else _print_progress,
     )
-    writers = {**_make_exporters(plan), "save": plan.save, "html": plan.to_html, "plots": plan.plot}
+    writers = _make_exporters(plan)
+    writers["save"] = plan.save
+    writers["html"] = plan.to_html
+    writers["plots"] = plan.plot
     if not _write(files, writers, f"{plan.summary()}\n"):
         return EXIT_MISUSE
     return EXIT_OK if plan.success else _STATUS_CODES.get(plan.status, EXIT_FAILED)
@@ -109,13 +114,14 @@ def _check_outputs(outputs: Mapping[str, str], **inputs: str) -> None:
     """Check that outputs can be written and do not overwrite inputs."""
     files: dict[str, str | Path] = {}
     for option, path in outputs.items():
+        files[f"--{option}"] = path
         if option in _FOLDERS:
             if Path(path).exists():
                 raise InputError(
                     "this already exists", file=path, field=f"--{option}", expected="a new folder"
                 )
             import_rosbags()
-        files[f"--{option}"] = Path(path, "metadata.yaml") if option in _FOLDERS else path
+            files[f"--{option}"] = Path(path, "metadata.yaml")
     read: dict[str, str | Path] = {}
     for name, path in inputs.items():
         is_folder = Path(path).is_dir()  # which stands for the scene in it
@@ -125,7 +131,8 @@ def _check_outputs(outputs: Mapping[str, str], **inputs: str) -> None:
 
 def _write(files: Mapping[str, str], writers: Writers, report: str = "") -> bool:
     """Write files by option, print the report and their names; return whether all are written."""
-    lines, errors = [report], []
+    lines = [report]
+    errors: list[str] = []
     for option, path in files.items():
         try:
             writers[option](path)
@@ -141,7 +148,8 @@ def _make_exporters(plan: Any, rate: float | None = None, **joints: Any) -> dict
     """Return the functions that write a plan for other programs, by option."""
 
     def write_ros(path: str) -> None:
-        write_atomically(path, f"{json.dumps(plan.to_ros(**joints, rate=rate))}\n".encode())
+        message = plan.to_ros(**joints, rate=rate)
+        write_atomically(path, f"{json.dumps(message)}\n".encode())
 
     return {
         "csv": functools.partial(plan.to_csv, **joints),
@@ -158,7 +166,7 @@ def _export(arguments: argparse.Namespace) -> int:
     if not files:
         expected = "--csv FILE, --json FILE, --ros FILE or --rosbag FOLDER"
         raise InputError("nothing to write", field="export", expected=expected)
-    if arguments.rate is not None and not {"ros", "rosbag"} & files.keys():
+    if arguments.rate is not None and "ros" not in files and "rosbag" not in files:
         expected = "--ros FILE or --rosbag FOLDER as well"
         raise InputError("only ROS' points can be resampled", field="--rate", expected=expected)
     if arguments.joints is not None and files.keys() == {"rosbag"}:
@@ -166,10 +174,12 @@ def _export(arguments: argparse.Namespace) -> int:
         raise InputError("recordings have all joints", field="--joints", expected=expected)
     _check_outputs(files, PLAN=arguments.plan)
     plan = vkc.Plan.load(arguments.plan)
-    names = arguments.joints.split(",") if arguments.joints else None
-    joints = names[0] if names is not None and len(names) == 1 and names[0] in GROUPS else names
-    chosen = {} if joints is None else {"joints": joints}
-    writers = _make_exporters(plan, arguments.rate, **chosen)
+    joints: dict[str, Any] = {}
+    if arguments.joints in GROUPS:
+        joints["joints"] = arguments.joints
+    elif arguments.joints:
+        joints["joints"] = arguments.joints.split(",")
+    writers = _make_exporters(plan, arguments.rate, **joints)
     return EXIT_OK if _write(files, writers) else EXIT_MISUSE
 
 
@@ -225,7 +235,8 @@ def _simulate(arguments: argparse.Namespace) -> int:
     plan = vkc.Plan.load(arguments.plan)
     actual = None
     if arguments.actual is not None:
-        start, names = plan.scene.start, plan.scene.robot.coordinates.names
+        start = plan.scene.start
+        names = plan.scene.robot.coordinates.names
         actual = vkc.load_scene(arguments.actual)
         if actual.robot.coordinates.names == names:  # `simulate` refuses another robot
             actual = actual.with_start(base=start[:3], arm=start[3:])
@@ -245,7 +256,8 @@ def _view(arguments: argparse.Namespace) -> int:
     from vkc_pin import visualization
     from vkc_pin.cli.shown import find_description, load_shown
 
-    files, what = _get_given(arguments, "html"), str(arguments.what)
+    files = _get_given(arguments, "html")
+    what = str(arguments.what)
     _check_outputs(files, WHAT=str(find_description(Path(what))))
     shown, frames = load_shown(what)
     if files:
@@ -265,8 +277,7 @@ def _srdf(arguments: argparse.Namespace) -> int:
 
     _check_outputs({"output": arguments.output}, ROBOT=arguments.robot)
     robot = load_robot(arguments.robot)
-    samples, seed = arguments.samples, arguments.seed
-    written = write_srdf(robot, arguments.output, samples=samples, seed=seed)
+    written = write_srdf(robot, arguments.output, samples=arguments.samples, seed=arguments.seed)
     sys.stdout.write(f"wrote {written}\n")
     return EXIT_OK
 

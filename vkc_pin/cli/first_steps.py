@@ -67,10 +67,10 @@ def _demo(arguments: argparse.Namespace) -> int:
     else:
         sys.stdout.write(f"open {page.as_uri()} in a browser\n")
     if find_compiler() is None:
+        compiler = os.environ.get("CC") or "cc"
         sys.stdout.write(
-            f"there is no C compiler ({os.environ.get('CC') or 'cc'}): later plans of a kind take "
-            "as long as the first, "
-            "and with one up to a third less\n"
+            f"there is no C compiler ({compiler}): later plans of a kind take "
+            "as long as the first, and with one up to a third less\n"
         )
     sys.stdout.write("next: vkc-pin new FOLDER starts a scene of your own\n")
     return EXIT_OK if plan.success else EXIT_FAILED
@@ -78,7 +78,8 @@ def _demo(arguments: argparse.Namespace) -> int:
 
 def _new(arguments: argparse.Namespace) -> int:
     folder = Path(arguments.folder)
-    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+    is_empty = folder.is_dir() and not any(folder.iterdir())
+    if folder.exists() and not is_empty:
         raise InputError(
             "this already exists", file=folder, field="FOLDER", expected="a new or empty folder"
         )
@@ -86,7 +87,8 @@ def _new(arguments: argparse.Namespace) -> int:
     for name in ("scene.yaml", "plan.py"):
         write_atomically(folder / name, (source / name).read_bytes())
         sys.stdout.write(f"wrote {folder / name}\n")
-    script, scene = (shlex.quote(str(folder / name)) for name in ("plan.py", "scene.yaml"))
+    script = shlex.quote(str(folder / "plan.py"))
+    scene = shlex.quote(str(folder / "scene.yaml"))
     sys.stdout.write(f"next: vkc-pin view {scene}, and python {script}\n")
     return EXIT_OK
 

@@ -109,7 +109,8 @@ def _read_packages(arguments: argparse.Namespace) -> dict[str, Any]:
 @contextlib.contextmanager
 def _print_progress() -> Iterator[None]:
     """Print the progress that imports log."""
-    logger, handler = logging.getLogger("vkc_pin.importing"), logging.StreamHandler(sys.stderr)
+    logger = logging.getLogger("vkc_pin.importing")
+    handler = logging.StreamHandler(sys.stderr)
     level = logger.level
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)
@@ -130,21 +131,20 @@ def _add_hand(parser: argparse.ArgumentParser, *, most: int) -> None:
 def _import_robot(arguments: argparse.Namespace) -> int:
     from vkc_pin.importing.robots.robot_import import import_robot
 
-    chosen = {
-        name: value
-        for name in ("most_pieces", "samples")
-        if (value := getattr(arguments, name)) is not None
-    }
+    settings = _read_packages(arguments)
+    if arguments.most_pieces is not None:
+        settings["most_pieces"] = arguments.most_pieces
+    if arguments.samples is not None:
+        settings["samples"] = arguments.samples
     made = import_robot(
         arguments.file,
         arguments.output,
         arm=arguments.arm,
         tool_frame=arguments.tool_frame,
         srdf=arguments.srdf,
-        **_read_packages(arguments),
         seed=arguments.seed,
         force=arguments.force,
-        **chosen,
+        **settings,
     )
     scene = shlex.quote(str(made.folder / "scene.yaml"))
     sys.stdout.write(f"{made}\ntry: vkc-pin plan {scene} --go-to 1 0 0\n")
@@ -167,7 +167,9 @@ def _import_object(arguments: argparse.Namespace) -> int:
             force=arguments.force,
             **_read_packages(arguments),
         )
-    written = [done.file, done.picture, *([] if done.scene is None else [done.scene])]
+    written = [done.file, done.picture]
+    if done.scene is not None:
+        written.append(done.scene)
     lines = "".join(f"wrote {file}\n" for file in written)
     sys.stdout.write(f"{done.summary()}\n{lines}{_suggest_plan(done)}")
     return EXIT_OK
@@ -217,10 +219,11 @@ def _find_robot(name: str) -> str | Path:
 
 
 def _parse_pairs(texts: list[str], field: str, form: str) -> dict[str, str]:
-    found = {}
+    """Return the values of texts "name=value" by name."""
+    pairs: dict[str, str] = {}
     for text in texts:
         name, equals, value = text.partition("=")
         if not (name and equals and value):
             raise InputError("not a name with a value", field=field, expected=form, got=repr(text))
-        found[name] = value
-    return found
+        pairs[name] = value
+    return pairs

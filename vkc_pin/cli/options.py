@@ -8,7 +8,9 @@ from typing import Any
 
 from vkc_pin.utils.command_line import parse_natural
 
-EXIT_FAILED, EXIT_MISUSE, EXIT_INFEASIBLE = 1, 2, 3
+EXIT_FAILED = 1
+EXIT_MISUSE = 2
+EXIT_INFEASIBLE = 3
 
 
 class CommandParser(argparse.ArgumentParser):

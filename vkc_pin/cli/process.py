@@ -17,7 +17,9 @@ from typing import Any, NoReturn, TextIO
 from vkc_pin.errors import BuildError
 from vkc_pin.utils.optional_imports import explain_unfit_libraries
 
-_MISUSE, _INTERRUPTED = 2, 130
+# exit codes
+_MISUSE = 2
+_INTERRUPTED = 130
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -106,6 +108,11 @@ def _make_tolerant(stream: TextIO | None, number: int) -> tuple[TextIO, _Toleran
     raw = _TolerantFile(number, "w", closefd=False)
     if not isinstance(stream, io.TextIOWrapper):
         stream = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")
-    names = ("encoding", "line_buffering", "write_through")
-    settings: dict[str, Any] = {name: getattr(stream, name) for name in names}
-    return io.TextIOWrapper(io.BufferedWriter(raw), errors="backslashreplace", **settings), raw
+    tolerant = io.TextIOWrapper(
+        io.BufferedWriter(raw),
+        encoding=stream.encoding,
+        errors="backslashreplace",
+        line_buffering=stream.line_buffering,
+        write_through=stream.write_through,
+    )
+    return tolerant, raw

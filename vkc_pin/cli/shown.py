@@ -21,8 +21,10 @@ if TYPE_CHECKING:
     from vkc_pin.planning.plan import Plan
 
 
-_ROBOT = "husky_ur5e"  # stands beside an object, for scale
-_BESIDE = 1.5  # [m] between the centre of its base and the object
+# stands beside an object, for scale
+_ROBOT = "husky_ur5e"
+# [m] between the centre of its base and the object
+_BESIDE = 1.5
 
 
 def load_shown(what: str) -> tuple[Plan | Scene, dict[str, pin.SE3]]:
@@ -60,9 +62,9 @@ def find_description(path: Path) -> Path:
 
 
 def _load_by_name(name: str) -> tuple[Scene, dict[str, pin.SE3]]:
-    scenes, objects = (
-        list_resources("scenes", pattern) for pattern in ("*.yaml", "objects/*.yaml")
-    )
+    """Load a scene, robot or object of the package."""
+    scenes = list_resources("scenes", "*.yaml")
+    objects = list_resources("scenes", "objects/*.yaml")
     if name in scenes or name.endswith((".yaml", ".yml")):
         return load_scene(name), {}
     robots = list_robots()
@@ -74,32 +76,36 @@ def _load_by_name(name: str) -> tuple[Scene, dict[str, pin.SE3]]:
 
 
 def _show_robot(file: Path) -> tuple[Scene, dict[str, pin.SE3]]:
+    """Return a scene of a robot alone, and its tool frame."""
     robot = load_robot(file)
     document = make_robot_scene(robot.name, str(file.resolve()), "omni")
     scene = Scene.from_document(document, file.parent)
     data = robot.model.createData()
     q = robot.coordinates.q(np.concatenate([np.zeros(3), robot.home]))
     pin.framesForwardKinematics(robot.model, data, q)
-    return scene, {robot.tool_frame: data.oMf[robot.model.getFrameId(robot.tool_frame)]}
+    frame = robot.model.getFrameId(robot.tool_frame)
+    return scene, {robot.tool_frame: data.oMf[frame]}
 
 
 def _show_object(file: Path) -> Scene:
+    """Return a scene of an object at the origin, with a robot in front of it."""
     item = load_object(file)
     data = item.model.createData()
-    pin.forwardKinematics(
-        item.model, data, item.coordinates.q(np.clip(0.0, item.lower, item.upper))
-    )
+    q = item.coordinates.q(np.clip(0.0, item.lower, item.upper))
+    pin.forwardKinematics(item.model, data, q)
     boxes = [
         compute_world_box(shape.geometry, data.oMi[shape.parentJoint] * shape.placement)
         for shape in item.collision.geometryObjects
     ]
-    low = min((float(low[0]) for low, _ in boxes), default=0.0)
-    reach = max((float(np.abs(box).max()) for box in boxes), default=0.0) + 2.0 * _BESIDE
+    front = min((float(low[0]) for low, _ in boxes), default=0.0)
+    size = max((float(np.abs(box).max()) for box in boxes), default=0.0)
+    reach = size + 2.0 * _BESIDE
+    placed = {"name": item.name, "type": str(file.resolve()), "position": [0.0, 0.0, 0.0]}
     document: dict[str, Any] = {
         "name": item.name,
         "robot": _ROBOT,
-        "start": {"base": [low - _BESIDE, 0.0, 0.0], "arm": "home"},
-        "arena": {axis: [-reach, reach] for axis in "xy"},
-        "objects": [{"name": item.name, "type": str(file.resolve()), "position": [0.0, 0.0, 0.0]}],
+        "start": {"base": [front - _BESIDE, 0.0, 0.0], "arm": "home"},
+        "arena": {"x": [-reach, reach], "y": [-reach, reach]},
+        "objects": [placed],
     }
     return Scene.from_document(document, file.parent)

@@ -42,7 +42,7 @@ _OPTIONS: tuple[tuple[str, str, dict[str, Any]], ...] = (
         {"nargs": 3, "type": float, "metavar": ("X", "Y", "YAW")},
     ),
     ("--joint NAME=VALUE", "bring a joint of the robot to a value [m], [rad]", {}),
-    (_THEN, "begin a new step: settings before and after it are two steps", {}),
+    (_THEN, "begin a new step: settings before and after it are two steps", {"nargs": 0}),
 )
 
 
@@ -51,9 +51,7 @@ def add_steps(plan: argparse.ArgumentParser) -> None:
     group = plan.add_argument_group("steps, in their order; each may be repeated")
     for form, text, settings in _OPTIONS:
         option = form.partition(" ")[0]
-        nargs = {"nargs": 0} if option == _THEN else {}
-        common = {"action": _AppendStep, "dest": "steps", "const": option}
-        add_option(group, form, text, **common, **nargs, **settings)
+        add_option(group, form, text, action=_AppendStep, dest="steps", const=option, **settings)
 
 
 class _AppendStep(argparse.Action):
@@ -72,7 +70,7 @@ def make_steps(given: Sequence[tuple[str, Any]]) -> list[Step]:
     Raises:
         InputError: There are none, or a value has another form.
     """
-    steps = list[Any]()
+    steps: list[Step] = []
     for option, group in itertools.groupby(given, key=lambda one: one[0]):
         values = [value for _, value in group]
         if option == "--set":
@@ -97,38 +95,39 @@ def parse_settings(settings: Sequence[str]) -> list[Step]:
     """
     from vkc_pin.world.task.steps import Actuate
 
-    grouped: list[tuple[str, dict[str, float]]] = []
+    steps: list[tuple[str, dict[str, float]]] = []  # objects, with the values of joints
     for text in settings:
         name, equals, value = text.partition("=")
         owner, dot, joint = name.strip().partition(".")
         if not (equals and dot and owner and joint):
             raise InputError("not a setting", field="--set", expected=_SETTING, got=repr(text))
         number = _parse_number(value, "--set", _SETTING, text)
-        if grouped and grouped[-1][0] == owner and joint not in grouped[-1][1]:
-            grouped[-1][1][joint] = number
-        else:
-            grouped.append((owner, {joint: number}))
-    return [Actuate(owner, joints) for owner, joints in grouped]
+        if not steps or steps[-1][0] != owner or joint in steps[-1][1]:
+            steps.append((owner, {}))
+        _, joints = steps[-1]
+        joints[joint] = number
+    return [Actuate(owner, joints) for owner, joints in steps]
 
 
 def _parse_joints(settings: Sequence[str]) -> list[Step]:
     """Return `Configure` steps of texts "joint=value"; a repeated joint begins a new step."""
     from vkc_pin.world.task.steps import Configure
 
-    grouped = list[dict[str, float]]()
+    steps: list[dict[str, float]] = []
     for text in settings:
-        joint, equals, value = text.partition("=")
-        joint = joint.strip()
+        name, equals, value = text.partition("=")
+        joint = name.strip()
         if not (equals and joint):
             raise InputError("not a setting", field="--joint", expected=_JOINT, got=repr(text))
         number = _parse_number(value, "--joint", _JOINT, text)
-        if not grouped or joint in grouped[-1]:
-            grouped.append({})
-        grouped[-1][joint] = number
-    return [Configure(joints) for joints in grouped]
+        if not steps or joint in steps[-1]:
+            steps.append({})
+        steps[-1][joint] = number
+    return [Configure(joints) for joints in steps]
 
 
 def _parse_number(text: str, field: str, expected: str, whole: str) -> float:
+    """Parse a number in the text `whole` of an option, `field`."""
     try:
         return float(text)
     except ValueError:

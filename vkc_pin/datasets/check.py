@@ -154,7 +154,7 @@ def check_dataset(
     valid = [record["number"] for record in records if not record["refused"]]
     order = np.random.default_rng(seed).permutation(len(valid))
     chosen = [valid[k] for k in order[:_PICTURES]]
-    shown_episodes = _read_selected(dataset, intact_shards, set(chosen))
+    shown_episodes = _read_by_number(dataset, intact_shards, set(chosen))
     pixels, differences = _compare_pixels(dataset.recipe, shown_episodes, chosen[:_RENDERED])
     # An unreadable episode fails the checks of both layouts for the same reason.
     reported = set(refused.values())
@@ -242,7 +242,7 @@ def _check_episode(shard: Shard, k: int, recipe: Recipe, robot: str) -> dict[str
     episode = shard.read(k)
     motion = episode.trajectory
     reasons: list[str] = []
-    # What an episode has whose scene cannot be read:
+    # Of an episode whose scene cannot be read:
     start = motion.positions[0]
     winding: dict[str, int] = {}
     about: dict[str, Any] = {
@@ -291,7 +291,7 @@ def _compare_pixels(
     """Render the first, middle and last images of episodes again.
 
     Returns:
-        What was compared, and the differences.
+        A line about the comparison, and the differences.
     """
     if not recipe.cameras:
         return "", []
@@ -439,12 +439,13 @@ def _check_consistency(dataset: Dataset, records: list[dict[str, Any]]) -> Itera
             continue
         row = table.get(record["number"], {})
         for name in row:
-            if name in record and not _is_cell_of(row[name], record[name]):
-                got, expected = format_value(row[name]), format_value(record[name])
-                yield f"episodes.csv: {name} of episode {record['number']} is {got}, not {expected}"
+            if name in record and not _shows_value(row[name], record[name]):
+                cell = f"{name} of episode {record['number']}"
+                got = format_value(row[name])
+                yield f"episodes.csv: {cell} is {got}, not {format_value(record[name])}"
 
 
-def _is_cell_of(text: str, value: Any) -> bool:
+def _shows_value(text: str, value: Any) -> bool:
     """Return whether a cell of a table shows a value, up to the rounding of numbers."""
     if not isinstance(value, float):
         return text == str(value)
@@ -454,7 +455,7 @@ def _is_cell_of(text: str, value: Any) -> bool:
         return False
 
 
-def _read_selected(dataset: Dataset, shards: Iterable[Path], numbers: set[int]) -> list[Episode]:
+def _read_by_number(dataset: Dataset, shards: Iterable[Path], numbers: set[int]) -> list[Episode]:
     """Return the episodes with some numbers, from the shards that contain them."""
     selected: list[Episode] = []
     for shard in shards:

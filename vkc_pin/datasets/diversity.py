@@ -24,7 +24,8 @@ _GROUND = 1.6
 def sample_coarse_trajectory(trajectory: Trajectory) -> list[list[float]]:
     """Return the coordinates at equally spaced times, rounded to 1 mm, as plain data."""
     times = np.linspace(trajectory.times[0], trajectory.times[-1], _SAMPLES)
-    return [[float(value) for value in row] for row in trajectory.at(times).round(3)]
+    rows: list[list[float]] = trajectory.at(times).round(3).tolist()
+    return rows
 
 
 class DuplicateFinder:

@@ -70,7 +70,8 @@ def find_grasping_start(
     Returns:
         The scene, or None if no configuration was found.
     """
-    name, attachment = step.object, str(step.attachment)
+    name = step.object
+    attachment = str(step.attachment)
     # Wherever the hand is: the chain does not depend on it.
     holding = scene.with_held({name: attachment})
     with planner.acquire() as cache:
@@ -232,7 +233,9 @@ def describe_problem(scene: Scene, steps: Sequence[Step]) -> dict[str, Any]:
             ((joint, goal),) = joints.items()
             task = "given-open" if step.object in scene.held else "drive-open"
         case [Grasp() as step, Place(object=name, pose=tuple() as point)] if name == step.object:
-            joint, goal, task = "", list(point), "fetch-place"
+            joint = ""
+            goal = list(point)
+            task = "fetch-place"
         case _:
             expected = "one Actuate of one joint, or Grasp and Place of one object"
             raise InputError("steps of no task", field="steps", expected=expected, got=steps)
@@ -321,12 +324,9 @@ def _sample_open_task(
     attachment = str(step.attachment)
     if fields.grasps == "any":
         link = item.attachments[attachment].link
-        names_on_link = [
-            one.name
-            for one in item.attachments.values()
-            if one.link == link and one.contact == "grasp"
-        ]
-        attachment = str(rng.choice(sorted(names_on_link)))
+        on_link = [one for one in item.attachments.values() if one.link == link]
+        graspable = [one.name for one in on_link if one.contact == "grasp"]
+        attachment = str(rng.choice(sorted(graspable)))
     step = Actuate(name, step.joints, attachment)
     if not given:
         start = _sample_start(recipe, place, rng, scene.objects[name].placement.translation)

@@ -447,7 +447,7 @@ def _find_files(document: Document, fields: RecipeSchema) -> dict[str, Any]:
 
 
 def _check_fields(document: Document, fields: RecipeSchema) -> None:
-    """Check what a schema cannot express."""
+    """Check conditions that a schema cannot express."""
     for k, kind in enumerate(fields.carried):
         if kind not in CARRIED:
             raise document.make_unknown_name_error(

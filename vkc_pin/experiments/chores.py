@@ -235,7 +235,9 @@ def run(
                         "method": method,
                     }
                 )
-    steps = {name: [str(step) for step in CHORES[name].list_steps()] for name in chores}
+    steps: dict[str, list[str]] = {}
+    for name in chores:
+        steps[name] = [str(step) for step in CHORES[name].list_steps()]
     settings = {
         "benchmark": "chores",
         "seed": seed,

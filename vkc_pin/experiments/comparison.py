@@ -50,7 +50,7 @@ from vkc_pin.world.scene.poses import as_placement
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate, GoTo, Place, Step
 
-WAYPOINTS = {f"{method}x{finer}": (method, finer) for finer in (1, 3) for method in BASELINES}
+WAYPOINTS = {"B1x1": ("B1", 1), "B2x1": ("B2", 1), "B1x3": ("B1", 3), "B2x3": ("B2", 3)}
 """Baselines with other numbers of waypoints: name → method, multiple of VKC's number."""
 _OWN = "VKC"
 COMPARED_PLANNERS = (*BASELINES, _OWN)
@@ -278,9 +278,11 @@ def _tabulate_criteria(
     """Tabulate all criteria over shared trials, or over each method's own successes."""
     rows: list[list[str]] = []
     for task in tasks:
+        compared: list[list[Record]] = []  # by method
         if shared:
             common = find_common_successes(select(records, scene=task), methods)
-            compared = [[row[k] for row in common] for k in range(len(methods))]
+            for k in range(len(methods)):
+                compared.append([row[k] for row in common])
         else:
             compared = [_select_records(records, task, method, good=True) for method in methods]
             rows.append([task, "n", *(str(len(own)) for own in compared)])

@@ -147,8 +147,9 @@ def find_fingers(world: World, physics: Physics) -> Fingers:
         return Fingers(gripper.names, gripper.closed, gripper.open)
     sides = _find_sides(world)
     names = ("side 0", "side 1")
-    servos = [
-        make_servo(
+    servos: list[Servo] = []
+    for name in names:
+        servo = make_servo(
             name,
             _MASS,
             physics.closing_force,
@@ -156,8 +157,7 @@ def find_fingers(world: World, physics: Physics) -> Fingers:
             physics.arm_bandwidth,
             physics.damping_ratio,
         )
-        for name in names
-    ]
+        servos.append(servo)
     return Fingers(names, np.full(2, sides.travel), np.zeros(2), sides, tuple(servos))
 
 

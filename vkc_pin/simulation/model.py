@@ -182,7 +182,7 @@ class Builder:
         self.spec.compiler.degree = False
 
     def _make_world(self, model: Any) -> PhysicalWorld:
-        """Find what the tree's joints, shapes and coordinates have become in a compiled model."""
+        """Find the tree's joints, shapes and coordinates in a compiled model."""
         joints = range(1, self.world.model.njoints)
         bodies = [0, *(int(model.body(f"body {j}").id) for j in joints)]
         geoms = [int(model.geom(f"shape {k}").id) for k in range(len(self.world.shapes))]

@@ -58,9 +58,9 @@ class Replay(World):
                 self._align_quaternions(name)
 
     def _align_quaternions(self, name: str) -> None:
-        """Negate quaternions of a free object that would be interpolated the long way round.
+        """Choose signs of a free object's quaternions such that none jumps.
 
-        q and −q are the same rotation.
+        q and −q are the same rotation, but interpolation passes all rotations between them.
         """
         placements = self._rows[:, self.get_placement_columns(name)]
         quaternions = placements[:, 3:]

@@ -119,10 +119,9 @@ def measure_hand(
     holder = physical.place_frame(data, hold.frame or scene.robot.tool_frame)
     link = physical.place_frame(data, f"{hold.object}.{attachment.link}")
     measured = holder.actInv(link * attachment.placement)
-    possible = [
-        min(max(value, freedom.lower), freedom.upper)
-        for value, freedom in zip(planned, attachment.freedoms, strict=True)
-    ]
+    possible: list[float] = []
+    for value, freedom in zip(planned, attachment.freedoms, strict=True):
+        possible.append(min(max(value, freedom.lower), freedom.upper))
     values, deviation = measure_deviation(attachment, measured, possible)
     distance, angle = compute_distances(deviation)
     if not is_within_grasp(distance, angle):

@@ -308,16 +308,12 @@ class _WindowFinder:
         """Yield windows of objects that move with their support, and of those on the same one."""
         for phase, supports in zip(self.trajectory.phases, self.supports, strict=True):
             for owner, support in supports.items():
-                others = [
-                    other
-                    for other, label in supports.items()
-                    if label == support and other != owner
-                ]
-                shapes = [
-                    k
-                    for k, label in enumerate(self.labels)
-                    if label == support or label.partition(".")[0] in others
-                ]
+                on_support = {other for other, label in supports.items() if label == support}
+                on_support.remove(owner)
+                shapes: list[int] = []
+                for k, label in enumerate(self.labels):
+                    if label == support or label.partition(".")[0] in on_support:
+                        shapes.append(k)
                 pairs = self._make_pairs(self._get_shapes(owner), shapes)
                 yield Window(pairs, phase.first, phase.last, -np.inf, moves_together=True)
 

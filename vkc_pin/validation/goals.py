@@ -107,11 +107,11 @@ def check_goals(samples: Samples, steps: Sequence[Step], tolerances: Tolerances)
     holds: list[list[bool]] = []
     reached = 0  # the number of phases after which the goal of the step before holds first
     for number, step in enumerate(steps):
-        misses = [
-            _compute_goal_errors(samples, step, end, tolerances)
-            + _find_missing_grasps(samples, steps, grasped, number, end)
-            for end in range(len(ends))
-        ]
+        misses: list[list[GoalError]] = []  # by the number of phases before
+        for end in range(len(ends)):
+            errors = _compute_goal_errors(samples, step, end, tolerances)
+            errors += _find_missing_grasps(samples, steps, grasped, number, end)
+            misses.append(errors)
         is_met = [not errors for errors in misses]
         holds.append(is_met)
         begin = len(ends) - 1 if number == last_step else reached
@@ -126,8 +126,11 @@ def check_goals(samples: Samples, steps: Sequence[Step], tolerances: Tolerances)
 
 def _find_nearest_end(misses: list[list[GoalError]], begin: int) -> int:
     """Return the first number of phases, from `begin` on, with the smallest largest miss."""
-    largest = [max(miss.amount for miss in errors) for errors in misses[begin:]]
-    return begin + largest.index(min(largest))
+
+    def find_largest(end: int) -> float:
+        return max(miss.amount for miss in misses[end])
+
+    return min(range(begin, len(misses)), key=find_largest)
 
 
 def find_grasped_objects(samples: Samples, steps: Sequence[Step]) -> list[set[str]]:
@@ -152,20 +155,20 @@ def find_grasped_objects(samples: Samples, steps: Sequence[Step]) -> list[set[st
         if owner in objects and objects[owner].object.free:
             frames.setdefault(owner, frame)
         if isinstance(step, Place | Release):
-            released = set(frames) if step.object is None else _find_released(frames, step.object)
+            released = set(frames) if step.object is None else _list_held_by(frames, step.object)
             frames = {name: frame for name, frame in frames.items() if name not in released}
         grasped.append(set(frames))
     return grasped
 
 
-def _find_released(frames: dict[str, str], owner: str) -> set[str]:
-    """Return an object and all that are grasped by it, by these, and so on."""
-    released = {owner}
+def _list_held_by(frames: dict[str, str], owner: str) -> set[str]:
+    """Return an object and all objects that it holds, that these hold, and so on."""
+    found = {owner}
     while True:
-        more = {name for name, frame in frames.items() if _get_owner(frame) in released}
-        if more <= released:
-            return released
-        released |= more
+        more = {name for name, frame in frames.items() if _get_owner(frame) in found}
+        if more <= found:
+            return found
+        found |= more
 
 
 def _find_missing_grasps(
@@ -363,12 +366,16 @@ def _compute_angle_error(placement: pin.SE3, target: pin.SE3, free: str) -> floa
     if free == "all":
         return 0.0
     if free == "heading":
-        # the world's vertical axis in the frames of both placements
-        vertical = placement.rotation[2]
-        target_vertical = target.rotation[2]
-        sine = np.linalg.norm(np.cross(vertical, target_vertical))
-        return float(np.arctan2(sine, vertical @ target_vertical))
+        return measure_tilt(placement, target)
     return float(np.linalg.norm(pin.log3(target.rotation.T @ placement.rotation)))
+
+
+def measure_tilt(placement: pin.SE3, other: pin.SE3) -> float:
+    """Return the angle between the world's vertical axes in the frames of two placements [rad]."""
+    vertical = placement.rotation[2]
+    other_vertical = other.rotation[2]
+    sine = float(np.linalg.norm(np.cross(vertical, other_vertical)))
+    return float(np.arctan2(sine, vertical @ other_vertical))
 
 
 def make_hold(scene: Scene, step: Grasp, attachment: str) -> Hold:

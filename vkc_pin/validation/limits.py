@@ -66,7 +66,9 @@ def find_limiting_constraints(
     torque_ratios = np.zeros((len(curve.times) - 1, torques.shape[1]))
     np.maximum.at(torque_ratios, moments.pieces, torques)
     ratios = np.hstack([velocity_ratios, acceleration_ratios, jerk_ratios, torque_ratios])
-    labels = [(name, kind) for kind in ("velocity", "acceleration", "jerk") for name in names]
+    labels: list[tuple[str, str]] = []
+    for kind in ("velocity", "acceleration", "jerk"):
+        labels += [(name, kind) for name in names]
     labels += [(name, "torque") for name in names[: torques.shape[1]]]
     rates = np.hstack([velocity_ratios, acceleration_ratios])
     is_moving = (rates > _MOTION_TOLERANCE).any(axis=1)

@@ -1,4 +1,4 @@
-"""Checks that released objects rest on something, and that the robot may carry what it holds."""
+"""Checks that released objects rest on something, and that no load exceeds the payload."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.options import Options
-from vkc_pin.validation.goals import find_grasped_objects
+from vkc_pin.validation.goals import find_grasped_objects, measure_tilt
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.tolerances import Tolerances
@@ -24,7 +24,7 @@ _MAX_FALL = 10.0
 
 @dataclasses.dataclass(frozen=True)
 class LoadCheck:
-    """Result of the check: violations, and what a step or an option allows, one line each."""
+    """Result of the check: violations, and exceptions that a step or option allows, as texts."""
 
     violations: tuple[Violation, ...]
     allowed: tuple[str, ...]
@@ -154,11 +154,7 @@ def _is_put_back(
         now = placed.placement
         then = before.placement
         shift = float(np.linalg.norm(now.translation - then.translation))
-        # the world's vertical axis in the frames of the object
-        vertical = now.rotation[2]
-        vertical_then = then.rotation[2]
-        sine = float(np.linalg.norm(np.cross(vertical, vertical_then)))
-        tilt = float(np.arctan2(sine, vertical @ vertical_then))
+        tilt = measure_tilt(now, then)
         if shift <= tolerances.goal_position and tilt <= tolerances.goal_angle:
             return True
     return False

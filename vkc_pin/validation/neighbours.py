@@ -2,8 +2,8 @@
 
 Furniture has smaller gaps than motions keep, and models of it overlap. Where two shapes are so at
 the start, or with all joints at zero, they need no clearance while their joints keep them close.
-They may overlap as deep as at the start, which exists. What they overlap with all joints at zero
-alone is taken for an error of the model up to 5 mm, else for an obstacle.
+They may overlap as deep as at the start, which exists. An overlap with all joints at zero alone is
+taken for an error of the model up to 5 mm, else for an obstacle.
 
 The planner finds such pairs by code of its own (`world.scene.clearance_exemptions`): an error there
 is found here.

@@ -105,7 +105,7 @@ class Samples:
                 self._check_hold(hold, where)
 
     def _check_hold(self, hold: Hold, where: str) -> None:
-        """Check that what a phase's hold names exists; `where` is the phase."""
+        """Check object, attachment, frame and coordinates of a hold; `where` is the phase."""
         owner = hold.object
         check_choice(owner, self.scene.objects, "object", f"{where}.held")
         attachments = self.scene.objects[owner].object.attachments
@@ -256,7 +256,8 @@ class Samples:
         robot = self.scene.robot
         if name in robot.coordinates.names:
             i = robot.coordinates.index(name)
-            lower, upper = float(robot.lower[i]), float(robot.upper[i])
+            lower = float(robot.lower[i])
+            upper = float(robot.upper[i])
             if i < 3 and robot.base == "fixed":
                 lower = upper = float(self.scene.start[i])
             if i < 2:

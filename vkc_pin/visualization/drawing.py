@@ -175,7 +175,9 @@ class Drawing:
         motion = self.motion
         up = np.array([0.0, 0.0, 1.0])
         # The base on the floor with 0.6 m around it, 1 m above, and the tool.
-        around = np.array([[x, y, 0.0] for x in (-0.6, 0.6) for y in (-0.6, 0.6)])
+        around = 0.6 * np.array(
+            [[-1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0]]
+        )
         points = [
             (motion.base[:, None] * (1.0 - up) + around).reshape(-1, 3),
             motion.base + up,

@@ -383,7 +383,7 @@ class _Comparison(_Writer):
                 self._compare(path, where, column.to_pylist(), truth.to_pylist(), tolerance)
 
     def _compare_descriptions(self, path: Path, stored: Any, truth: Any) -> None:
-        """Compare what the schemas of a file say about columns, if both say anything."""
+        """Compare the descriptions of columns in the schemas of a file, if both have one."""
         key = _SCHEMA_KEY.encode()
         stored_metadata = stored.metadata or {}
         true_metadata = truth.metadata or {}

@@ -285,11 +285,9 @@ def _add_legend(row: Sequence[Axes]) -> None:
     handles, _ = row[0].get_legend_handles_labels()
     limits: list[Any] = []
     for axes in row:
-        limits += [
-            handle
-            for handle in axes.get_legend_handles_labels()[0]
-            if handle.get_label() == "limit"
-        ]
+        for handle in axes.get_legend_handles_labels()[0]:
+            if handle.get_label() == "limit":
+                limits.append(handle)
     row[-1].legend(
         handles=[*handles, *limits[:1]],
         loc="center left",

@@ -71,6 +71,13 @@ def test_rates_are_evaluated_on_the_curve(plan: Plan) -> None:
         assert np.abs(line.get_ydata()).max() == pytest.approx(peaks[:, 2].max(), rel=1e-3)
 
 
+def test_pairs_that_may_touch_are_dotted(figures: dict[str, Any]) -> None:
+    (axes,) = figures["clearance"].axes
+    styles = {line.get_label().split(":")[0]: line.get_linestyle() for line in axes.lines}
+    assert styles["gripper – grasped object"] == ":"
+    assert styles["robot – itself"] == "-"
+
+
 def test_clearance_names_the_closest_pairs(figures: dict[str, Any], plan: Plan) -> None:
     (axes,) = figures["clearance"].axes
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("time [s]", "clearance [mm]")

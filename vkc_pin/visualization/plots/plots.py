@@ -40,12 +40,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, FigureBase
 
 
+_MAY_TOUCH = "gripper – grasped object"
 _KINDS = (
     "robot – itself",
     "robot – objects",
     "robot – obstacles",
     "objects – surroundings",
-    "gripper – grasped object",
+    _MAY_TOUCH,
 )
 SAMPLES = 240
 """Number of times at which a motion is drawn, besides its waypoints and knots."""
@@ -443,10 +444,10 @@ def _draw_clearance(figure: FigureBase, plan: CheckedMotion) -> None:
     lowest = 0.0
     for k, curve in enumerate(compute_clearance_curves(plan.scene, trajectory, times)):
         distance, when, pair = curve.closest()
-        touching = "grasps" in curve.name
-        colour = "0.6" if touching else COLOURS[k % len(COLOURS)]
+        may_touch = curve.name == _MAY_TOUCH
+        colour = "0.6" if may_touch else COLOURS[k % len(COLOURS)]
         label = f"{curve.name}: {1e3 * distance:.0f} mm, {pair}, {when:.1f} s"
-        style: Any = {"linestyle": ":" if touching else "-", "linewidth": 1.5, "label": label}
+        style: Any = {"linestyle": ":" if may_touch else "-", "linewidth": 1.5, "label": label}
         axes.plot(curve.times, 1e3 * curve.distances, color=colour, **style)
         if distance < _SHOWN:
             axes.plot([when], [1e3 * distance], "o", color=colour, markersize=4.5)

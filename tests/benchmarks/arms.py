@@ -100,7 +100,8 @@ def run(
 
 def format_results(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown."""
-    about, records = result["meta"], result["trials"]
+    about = result["meta"]
+    records = result["trials"]
     settings = [(base, goal) for base in about["bases"] for goal in about["goals"]]
     rows = [
         _row(base, goal, method, own)
@@ -168,7 +169,9 @@ def _record(spec: dict[str, Any], *, folder: str, robot: str) -> dict[str, Any]:
     own = PeerProblem(problem.scene, (_make_step(problem, spec["goal"]),))
     exact = build_program(PeerProblem(problem.scene, (Configure(problem.goal),)), options)
     is_valid = _is_valid(exact)
-    method, seed, began = spec["method"], spec["seed"], time.process_time()
+    method = spec["method"]
+    seed = spec["seed"]
+    began = time.process_time()
     if method in PEERS:
         found, peer = plan_by_peer(own, method, seed, Clock(spec["time_limit"]), options)
         own_time = peer.own

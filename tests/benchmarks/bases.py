@@ -124,7 +124,8 @@ def _name_robots(robots: Sequence[str] | None) -> dict[str, str | None]:
 
 def format_results(result: Mapping[str, Any]) -> str:
     """Return the table of a result in Markdown."""
-    about, records = result["meta"], result["trials"]
+    about = result["meta"]
+    records = result["trials"]
     rows = [
         _row(robot, task, base, records)
         for robot in about["robots"]

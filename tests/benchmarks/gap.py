@@ -52,7 +52,8 @@ def run(
 
 def format_results(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown."""
-    about, records = result["meta"], result["trials"]
+    about = result["meta"]
+    records = result["trials"]
     return join_sections(
         about,
         "# Through a gap to a table",
@@ -65,7 +66,8 @@ def format_results(result: Mapping[str, Any]) -> str:
 
 
 def _record(spec: dict[str, Any]) -> dict[str, Any]:
-    number, seed = spec["number"], spec["seed"]
+    number = spec["number"]
+    seed = spec["seed"]
     return run_trial(
         make_start(seed, number),
         (Reach(POSE),),

@@ -90,9 +90,13 @@ def _box(rng: np.random.Generator, number: int) -> dict[str, Any]:
     """Return a small box on a wall, under the ceiling or outside."""
     along, depth, height = rng.uniform((0.03, 0.01, 0.03), (0.15, 0.05, 0.15))
     x, y, z = rng.uniform((-2.3, -1.9, height / 2), (2.3, 1.9, _CEILING - height / 2))
-    beside, sign = rng.uniform(0.8, 1.9), rng.choice([-1.0, 1.0])  # of the door
+    # Of the door
+    beside = rng.uniform(0.8, 1.9)
+    sign = rng.choice([-1.0, 1.0])
     outside = (rng.uniform(-6.0, 6.0), sign * rng.uniform(2.4, 4.0), z)
-    in_x, in_y, flat = (depth, along, height), (along, depth, height), (along, along, depth)
+    in_x = (depth, along, height)
+    in_y = (along, depth, height)
+    flat = (along, along, depth)
     size, position = (
         (in_x, (_WEST + depth / 2, y, z)),
         (in_x, (_EAST - depth / 2, sign * beside, z)),
@@ -134,7 +138,8 @@ def specify(
     Starts are free among the largest number of obstacles.
     """
     most = max(*AXES["obstacles"].counts, *(counts if of == "obstacles" else ()))
-    rng, scene = np.random.default_rng(seed), _crowded(most)
+    rng = np.random.default_rng(seed)
+    scene = _crowded(most)
     bases = [scene.sample_start(rng).start[:3].tolist() for _ in range(starts)]
     return [
         {
@@ -195,7 +200,9 @@ def run(
 
 def format_results(result: Mapping[str, Any]) -> str:
     """Return the table of a result in Markdown."""
-    about, records, rows = result["meta"], result["trials"], []
+    about = result["meta"]
+    records = result["trials"]
+    rows = []
     of = about["of"]
     usual = AXES[of].usual
     timed = [record for record in records if record.get("planning_time") is not None]

@@ -16,7 +16,8 @@ from tests.benchmarks.robot_object_matrix import robots
 from tests.benchmarks.robot_object_matrix import run as matrix
 from vkc_pin.experiments import chores, door_and_drawer, execution, household, initialization
 
-ONE, ONE_START = {"trials": 1, "seed": 0}, {"starts": 1, "seed": 0}
+ONE = {"trials": 1, "seed": 0}
+ONE_START = {"starts": 1, "seed": 0}
 WRONG: list[tuple[Callable[..., Any], dict[str, Any], str]] = [
     (ablation.run, {"problems": [60]}, "0 to 59"),
     (ablation.run, {"problems": []}, "nothing to run"),

@@ -87,7 +87,8 @@ def test_problem_is_posed_to_another_arm(tmp_path: Path) -> None:
     shelf["primitives"] = [{"type": "box", "dimensions": [0.1, 1.0, 0.1]}] * 2
     upper = {"position": [0.7, 0.0, 0.9], "orientation": [0.0, 0.0, 0.0, 1.0]}
     shelf["primitive_poses"] = [upper, {**upper, "position": [0.7, 0.0, 0.5]}]
-    given, made = tmp_path / "given", tmp_path / "made"
+    given = tmp_path / "given"
+    made = tmp_path / "made"
     given.mkdir()
     write(given, scene, make_request())
     script["main"](str(given), ROBOT, "panda", str(made))

@@ -62,7 +62,8 @@ def test_planning_times_are_tabulated_by_count(
 
 @pytest.mark.parametrize("segments", [4, 20, 76, 320])
 def test_refined_options_divide_the_same_time(segments: int) -> None:
-    refined, usual = make_refined_options(segments), vkc.Options()
+    refined = make_refined_options(segments)
+    usual = vkc.Options()
     parts, shares = (
         np.array([one.reach_waypoints, one.turn_waypoints, one.move_waypoints])
         for one in (refined, usual)

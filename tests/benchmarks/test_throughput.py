@@ -31,7 +31,9 @@ def test_equal_tasks_waste_time_only_at_the_end(tasks: int, efficiency: float) -
 
 def test_busy_client_limits_the_workers() -> None:
     costs = Costs((2.0,), (2.0,), client=0.1, episodes=1.0)
-    few, many = simulate_workers(costs, 10), simulate_workers(costs, 200)  # 20 workers saturate it
+    # 20 workers saturate it.
+    few = simulate_workers(costs, 10)
+    many = simulate_workers(costs, 200)
     assert few["efficiency"] > 0.95
     assert few["client"] == pytest.approx(0.5, abs=0.03)
     assert many["client"] > 0.99
@@ -65,7 +67,8 @@ pytest.importorskip("h5py")
 
 @pytest.mark.long
 def test_each_task_has_a_record(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    recipe, out = write_recipe(tmp_path), tmp_path / "out"
+    recipe = write_recipe(tmp_path)
+    out = tmp_path / "out"
     command = f"throughput --episodes 2 --out {out} --recipe {recipe} --quiet"
     assert main(command.split()) == 0
     assert "drive-open" in capsys.readouterr().out

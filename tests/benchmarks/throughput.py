@@ -109,7 +109,8 @@ def simulate_workers(costs: Costs, workers: int, tasks: int | None = None) -> di
     def send(worker: int) -> None:
         nonlocal free
         free += half
-        task, begins = len(spans), max(ready[worker], free)
+        task = len(spans)
+        begins = max(ready[worker], free)
         drawn = costs.first if task < workers else later
         ready[worker] = begins + drawn[int(rng.integers(len(drawn)))]
         spans.append((begins, ready[worker]))
@@ -118,10 +119,13 @@ def simulate_workers(costs: Costs, workers: int, tasks: int | None = None) -> di
     for _ in range(_AHEAD):
         for worker in range(workers):
             send(worker)
-    left, results = wanted, 0
+    left = wanted
+    results = 0
     while True:
         moment, task, worker = heapq.heappop(ended)
-        free, results, left = max(free, moment) + half, results + 1, left - (task < wanted)
+        free = max(free, moment) + half
+        results += 1
+        left -= task < wanted
         if not left:
             break
         send(worker)
@@ -172,7 +176,8 @@ def run(
     """
     if episodes < 1:
         raise InputError("out of range", field="episodes", expected="at least 1", got=episodes)
-    made, folder = load_recipe(recipe), Path(out)
+    made = load_recipe(recipe)
+    folder = Path(out)
     check_folder(folder, [f"{task}/journal.jsonl" for task in TASKS])
     counts = sorted(
         {*(count for count in (1, 2) if curve and scheduler is None and count < jobs), jobs}
@@ -181,7 +186,8 @@ def run(
     curves: list[dict[str, Any]] = []
     many: list[dict[str, Any]] = []
     for task in TASKS:
-        own, rates = load_recipe({**made.document, "tasks": [task]}), dict[int, float]()
+        own = load_recipe({**made.document, "tasks": [task]})
+        rates = dict[int, float]()
         for count in counts:
             where = folder / task if count == jobs else folder / f"{count}_workers" / task
             began = time.perf_counter()
@@ -301,7 +307,8 @@ def _size(dataset: Dataset) -> int:
 
 def format_results(result: Mapping[str, Any]) -> str:
     """Return the table of a result in Markdown."""
-    about, records = result["meta"], result["trials"]
+    about = result["meta"]
+    records = result["trials"]
     head = [
         "task",
         "episodes per hour",

@@ -72,14 +72,16 @@ def write_arms(
     )
     for side in sides:
         y = {"left_": 0.3, "right_": -0.3}.get(side, 0.0)
-        below, at = "body", f"0 {y} 0.16"
+        below = "body"
+        at = f"0 {y} 0.16"
         for k, axis in enumerate(("0 0 1", "0 1 0", "0 1 0", "0 0 1", "0 1 0")):
             name = f"{side}arm_{k + 1}"
             parts += [
                 _format_link(name, "0.06 0.06 0.16", "0 0 0.1"),
                 _format_joint(f"{name}_joint", "revolute", below, name, at, axis),
             ]
-            below, at = name, "0 0 0.2"
+            below = name
+            at = "0 0 0.2"
         parts += [
             _format_link(f"{side}hand", "0.05 0.14 0.06", "0 0 0.03"),
             _format_joint(f"{side}wrist", "fixed", below, f"{side}hand", at),

@@ -65,7 +65,8 @@ def make_clutter(seed: int, count: int, *, reach: float = 4.5) -> list[Shape]:
     shapes: list[Shape] = []
     for k in range(count):
         x, y = rng.uniform(-reach, reach, 2)
-        height, yaw = rng.uniform(0.2, 2.0), rng.uniform(0.0, np.pi)
+        height = rng.uniform(0.2, 2.0)
+        yaw = rng.uniform(0.0, np.pi)
         if k % 4 == 0:
             shapes.append(
                 (coal.Box(*rng.uniform(0.1, 0.8, 2), height), make_pose(x, y, height / 2, yaw))

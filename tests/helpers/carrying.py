@@ -99,8 +99,10 @@ def solve_reach(tool: pin.SE3, guess: np.ndarray = GUESS) -> np.ndarray:
 
     Newton's method on numeric Pinocchio starts at `guess`, then at random points around it.
     """
-    robot, rng = make_hall().robot, np.random.default_rng(0)
-    model, data = robot.model, robot.model.createData()
+    robot = make_hall().robot
+    rng = np.random.default_rng(0)
+    model = robot.model
+    data = robot.model.createData()
     frame = model.getFrameId(robot.tool_frame)
     found = []
     for spread in (0.0, *np.linspace(0.1, 0.8, 40)):
@@ -164,7 +166,8 @@ class MotionBuilder:
     def go(self, row: np.ndarray, *, steps: int = 20) -> MotionBuilder:
         """Move to `row` from rest to rest."""
         fraction = np.linspace(0.0, 1.0, steps + 1)[1:, None]
-        smooth, before = fraction**2 * (3.0 - 2.0 * fraction), self.rows[-1]
+        smooth = fraction**2 * (3.0 - 2.0 * fraction)
+        before = self.rows[-1]
         first = len(self.rows) - 1
         self.rows += list(before + smooth * (row - before))
         holds = make_holds(self.held, self.by)
@@ -198,7 +201,8 @@ class MotionBuilder:
 
     def motion(self, *, dt: float = DT, **columns: Sequence[float]) -> Trajectory:
         """Return the motion; `columns` replaces values of grasp coordinates at all waypoints."""
-        robot, shape = self.scene.robot.coordinates.names, len(self.rows)
+        robot = self.scene.robot.coordinates.names
+        shape = len(self.rows)
         extra = [np.full(shape, value) for value in self.values.values()]
         rows = np.column_stack([np.array(self.rows), *extra])
         names = (*robot, *self.values)

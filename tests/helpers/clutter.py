@@ -13,7 +13,8 @@ from vkc_pin.world.scene.scene import Scene
 
 def describe_random_obstacles(seed: int, count: int) -> list[dict[str, Any]]:
     """Return `count` random obstacles of 1 cm to 3 m, near and far, partly rotated."""
-    rng, obstacles = np.random.default_rng(seed), []
+    rng = np.random.default_rng(seed)
+    obstacles = []
     for number in range(count):
         size = (10.0 ** rng.uniform(-2.0, 0.5, 3)).tolist()
         obstacle: dict[str, Any] = {

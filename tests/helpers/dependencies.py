@@ -34,7 +34,8 @@ def find_undeclared(extra: str = "") -> list[str]:
     project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     pending = [(Requirement(text), "") for text in project["dependencies"]]
     pending += [(Requirement(text), "") for text in project["optional-dependencies"].get(extra, [])]
-    declared, seen = {"vkc-pin"}, set[tuple[str, str]]()
+    declared = {"vkc-pin"}
+    seen = set[tuple[str, str]]()
     while pending:
         requirement, parent_extra = pending.pop()
         if requirement.marker and not requirement.marker.evaluate({"extra": parent_extra}):

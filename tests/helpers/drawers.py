@@ -17,7 +17,8 @@ from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene, load_scene
 
-MARGIN, HAND_CLEARANCE = 0.02, 0.005  # [m]: Options.dist_safe and Options.grasp_clearance
+MARGIN = 0.02  # [m] Options.dist_safe
+HAND_CLEARANCE = 0.005  # [m] Options.grasp_clearance
 SHORT = Options(reach_waypoints=5, turn_waypoints=3, move_waypoints=8)
 # The hand is near the handle of the closed drawer.
 NEAR_HANDLE = np.array([0.63, 0.08, 0.42, 2.288, -0.13, -0.55, 0.681, 1.141, 1.571])
@@ -77,7 +78,8 @@ def _solve_grasp() -> np.ndarray:
 
 def make_grasping_scene(scene: Scene | None = None, attachment: str = "handle") -> Scene:
     """Return the scene with the robot grasping the closed drawer, its base 1.2 m in front of it."""
-    scene, row = scene or load_drawer_scene(), _solve_grasp()
+    scene = scene or load_drawer_scene()
+    row = _solve_grasp()
     return scene.with_start(base=row[:3], arm=row[3:]).with_held({"drawer": attachment})
 
 
@@ -89,8 +91,11 @@ def compute_spare_clearance(
     Pairs are those within the robot, of the robot and the scene, and, if `held`, of the grasped
     tray and other objects and obstacles. `row` begins with the robot's coordinates.
     """
-    robot, state = scene.robot, {"drawer": {"slide": slide}}
-    model, data, shapes = robot.model, robot.model.createData(), robot.collision.createData()
+    robot = scene.robot
+    state = {"drawer": {"slide": slide}}
+    model = robot.model
+    data = robot.model.createData()
+    shapes = robot.collision.createData()
     pin.updateGeometryPlacements(
         model, data, robot.collision, shapes, robot.coordinates.q(np.array(row[: model.nv]))
     )

@@ -106,12 +106,14 @@ def _compute_walls_beside_door() -> dict[str, tuple[float, float, float, float]]
     door = vkc.load_object(vkc.procedural.random_object("door", PLACES["door"][3]))
     import pinocchio as pin
 
-    data, yaw = door.model.createData(), PLACES["door"][2]
+    data = door.model.createData()
+    yaw = PLACES["door"][2]
     pin.forwardKinematics(door.model, data, door.coordinates.q(np.zeros(door.coordinates.size)))
     xs = []
     for shape in door.collision.geometryObjects:
         shape.geometry.computeLocalAABB()
-        box, at = shape.geometry.aabb_local, data.oMi[shape.parentJoint] * shape.placement
+        box = shape.geometry.aabb_local
+        at = data.oMi[shape.parentJoint] * shape.placement
         for corner in np.array(np.meshgrid(*zip(box.min_, box.max_, strict=True))).reshape(3, -1).T:
             xs.append(
                 (

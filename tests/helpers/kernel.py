@@ -22,7 +22,8 @@ class Kernel:
     """
 
     def __init__(self, manager: Any, client: Any) -> None:
-        self.manager, self.client = manager, client
+        self.manager = manager
+        self.client = client
 
     def run(
         self, code: str, *, interrupt: str | None = None, delay: float = 0.0, timeout: float = 120.0
@@ -41,7 +42,8 @@ class Kernel:
         end = time.monotonic() + timeout
         while True:
             message = self.client.get_iopub_msg(timeout=max(0.1, end - time.monotonic()))
-            kind, content = message["msg_type"], message["content"]
+            kind = message["msg_type"]
+            content = message["content"]
             if message["parent_header"].get("msg_id") != sent:
                 continue
             if kind == "status" and content["execution_state"] == "idle":

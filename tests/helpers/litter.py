@@ -7,7 +7,9 @@ from typing import Any
 from vkc_pin.world.files.resources import find_resource_folder
 from vkc_pin.world.scene.scene import Scene
 
-LITTER_POSITION, BIN_POSITION, BELOW_SHELF = (1.0, 0.0, 0.036), (0.0, 2.0, 0.16), (-1.0, 0.0, 0.037)
+LITTER_POSITION = (1.0, 0.0, 0.036)
+BIN_POSITION = (0.0, 2.0, 0.16)
+BELOW_SHELF = (-1.0, 0.0, 0.037)
 
 
 def describe_shelf(x: float, y: float) -> dict[str, Any]:

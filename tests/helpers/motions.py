@@ -83,7 +83,8 @@ def make_object_motion(
     **values: Sequence[float] | Floats,
 ) -> Trajectory:
     """Return a motion of an object's coordinates, with the robot at rest."""
-    count, robot = len(next(iter(values.values()))), scene.robot.coordinates.names
+    count = len(next(iter(values.values())))
+    robot = scene.robot.coordinates.names
     rows = np.column_stack([np.tile(scene.start, (count, 1)), *values.values()])
     names = (*robot, *(f"{owner}.{name}" for name in values))
     phases = phases or (PhaseSpan("move", 0, count - 1),)

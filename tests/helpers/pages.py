@@ -14,7 +14,9 @@ import umsgpack
 def read_commands(text: str) -> list[dict[str, Any]]:
     match = re.search(r'id="commands">([^<]*)<', text)
     assert match
-    data, at, found = gzip.decompress(base64.b64decode(match[1])), 0, []
+    data = gzip.decompress(base64.b64decode(match[1]))
+    at = 0
+    found = []
     while at < len(data):
         (size,) = struct.unpack_from("<I", data, at)
         found.append(umsgpack.unpackb(data[at + 4 : at + 4 + size]))

@@ -12,8 +12,10 @@ def list_pair_margins(
     problem: TrajectoryProblem, phase: int, *, waypoint: int | None = None
 ) -> dict[tuple[str, str], list[float]]:
     """Return (link, link or obstacle) → margins of their pairs at a waypoint, or unreduced."""
-    part, found = problem.contacts.phases[phase], dict[tuple[str, str], list[float]]()
-    margins, pairs = part.margins, np.arange(len(part.pairs))
+    part = problem.contacts.phases[phase]
+    found = dict[tuple[str, str], list[float]]()
+    margins = part.margins
+    pairs = np.arange(len(part.pairs))
     if waypoint is not None:
         margins = get_margins(part, pairs, np.full(len(pairs), waypoint))
     for (first, second), margin in zip(part.pairs.tolist(), margins.tolist(), strict=True):

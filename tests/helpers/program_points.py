@@ -64,7 +64,8 @@ class ProgramPoint:
 
     def relax_target(self, waypoint: int, number: int) -> pin.SE3:
         """Return the relaxed target of a pose at a waypoint, computed by Pinocchio."""
-        target, offsets = self.problem.targets[number], self.pose_offsets[waypoint - 1, number]
+        target = self.problem.targets[number]
+        offsets = self.pose_offsets[waypoint - 1, number]
         e = self.relaxation[waypoint - 1]
         turn = pin.exp3(e * offsets[6] * offsets[3:6])
         return pin.SE3(target.rotation @ turn, target.translation + e * offsets[:3])
@@ -86,16 +87,21 @@ class ProgramPoint:
         Nonzeros missing in a sparsity pattern show up as differences, too.
         """
         objective, constraints, lagrangian = self.functions()
-        rng, parameters, weight, h = np.random.default_rng(3), self.parameters, 0.7, 1e-6
+        rng = np.random.default_rng(3)
+        parameters = self.parameters
+        weight = 0.7
+        h = 1e-6
         multipliers = rng.normal(size=constraints.size1_out(0))
 
         def evaluate(x: np.ndarray) -> tuple[ca.DM, np.ndarray, np.ndarray]:
-            (f, gradient), (g, jacobian) = objective(x, parameters), constraints(x, parameters)
+            f, gradient = objective(x, parameters)
+            g, jacobian = constraints(x, parameters)
             slopes = weight * gradient + jacobian.T @ multipliers
             return ca.vertcat(gradient.T, jacobian), ca.vertcat(f, g).full(), slopes.full()
 
         x = self.x
-        jacobian, upper = evaluate(x)[0], lagrangian(x, parameters, weight, multipliers)
+        jacobian = evaluate(x)[0]
+        upper = lagrangian(x, parameters, weight, multipliers)
         assert upper.sparsity().is_triu()
         hessian = upper + ca.triu(upper, False).T
         for direction in rng.normal(size=(4, len(x))):
@@ -109,8 +115,11 @@ class ProgramPoint:
 
 def make_random_point(p: TrajectoryProblem, seed: int = 0) -> ProgramPoint:
     """Return a point with relaxation variables between 0 and 1, and random excess."""
-    rng, t = np.random.default_rng(seed), p.transcription
-    N, K, poses = t.segments, t.slots, len(p.pose_goals)
+    rng = np.random.default_rng(seed)
+    t = p.transcription
+    N = t.segments
+    K = t.slots
+    poses = len(p.pose_goals)
     axes = rng.normal(size=(N, poses, 3))
     axes /= np.linalg.norm(axes, axis=2, keepdims=True)
     turns = rng.uniform(0.0, np.pi, (N, poses, 1))

@@ -9,15 +9,19 @@ from vkc_pin.planning.nlp.merit import Merit, compute_shortfalls, measure_infeas
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 
 QUIET = {"ipopt.print_level": 0, "ipopt.sb": "yes"}
-CLEARANCE, REST = 31.0, 17.0  # weights
+# Weights
+CLEARANCE = 31.0
+REST = 17.0
 
 
 class RelaxedProgram:
     """A program, with rate rows, set up at an iterate with the timing of the stationary motion."""
 
     def __init__(self, problem: TrajectoryProblem, z: np.ndarray) -> None:
-        p, t = problem, problem.transcription
-        self.problem, self.z = problem, z
+        p = problem
+        t = problem.transcription
+        self.problem = problem
+        self.z = z
         self.timing = p.timing_for(p.still)  # other motions are too fast
         contacts = p.evaluate_contacts(z, reach=p.options.contact_reach, nearest=t.slots)
         self.slack = compute_shortfalls(contacts, t.segments, t.slots)
@@ -30,7 +34,8 @@ class RelaxedProgram:
         self.lower, self.upper = p.row_bounds(self.timing)
 
     def _parameters(self, *, relaxed: bool) -> np.ndarray:
-        p, f = self.problem, self.found
+        p = self.problem
+        f = self.found
         planes, offsets = self._planes
         values = {"planes": planes, "offsets": offsets, "penalty": CLEARANCE, "dt": self.timing.dt}
         values |= p.parameters_at(self.z)
@@ -69,7 +74,8 @@ class RelaxedProgram:
 def make_iterates(problem: TrajectoryProblem, count: int = 3) -> list[np.ndarray]:
     """Return z_1..z_N, shape (N, n): random, some outside the limits, or constant."""
     rng = np.random.default_rng(20)
-    lower, upper = problem.chain.lower, problem.chain.upper
+    lower = problem.chain.lower
+    upper = problem.chain.upper
     inside = [sample_configurations(lower, upper, problem.segments, rng) for _ in range(count)]
     return [*inside, rng.normal(scale=10.0, size=problem.still.shape), problem.still]
 
@@ -80,7 +86,8 @@ def check_relaxation(problem: TrajectoryProblem, z: np.ndarray) -> dict[str, flo
     With relaxation variables of 1 the program is feasible and its cost is the merit; with 0 it is
     exact. In between, violations are proportional.
     """
-    t, at = problem.transcription, RelaxedProgram(problem, z)
+    t = problem.transcription
+    at = RelaxedProgram(problem, z)
     raw = at.rows(0.0)
     residual = at.violations(at.rows(1.0))
     fractions = np.random.default_rng(21).uniform(0.1, 0.9, t.segments)
@@ -94,7 +101,8 @@ def check_relaxation(problem: TrajectoryProblem, z: np.ndarray) -> dict[str, flo
     np.testing.assert_array_equal(raw, at.rows(0.0, relaxed=False))
     np.testing.assert_array_equal(raw, at.rows(1.0, relaxed=False))
     # Rows of planes have slacks of their own.
-    between, firm = at.rows(fractions), t.first_relaxed_row
+    between = at.rows(fractions)
+    firm = t.first_relaxed_row
     np.testing.assert_array_equal(between[t.slot_rows], raw[t.slot_rows])
     owners = np.concatenate([t.row_waypoints, t.rate_waypoints])
     np.testing.assert_allclose(

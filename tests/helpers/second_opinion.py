@@ -51,10 +51,13 @@ class PlanJudge:
 
     def verdicts(self, folder: Path) -> list[Verdict]:
         """Judge the plans collected since the last call; return the verdicts that disagree."""
-        found, waiting, self._waiting = [], self._waiting, []
+        found = []
+        waiting = self._waiting
+        self._waiting = []
         self.planned += len(waiting)
         for plan in waiting:
-            if (digest := _compute_digest(plan)) in self._known:
+            digest = _compute_digest(plan)
+            if digest in self._known:
                 continue
             self._known.add(digest)
             path = plan.save(folder / f"{digest}.npz")

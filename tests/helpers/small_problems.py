@@ -93,7 +93,8 @@ def replace_attachment(placed: PlacedObject, attachment: Attachment) -> PlacedOb
 @cache
 def make_full_scene() -> Scene:
     """Return the door's room with a drawer and a cabinet that has attachments of every kind."""
-    scene, drawer = load_door_scene(), load_scene("drawer").objects["drawer"]
+    scene = load_door_scene()
+    drawer = load_scene("drawer").objects["drawer"]
     state = np.array([CABINET_STATE[name] for name in load_cabinet().coordinates.names])
     case = PlacedObject(
         "cabinet",
@@ -154,8 +155,10 @@ def sample_configurations(
     arena: float = 2.0,
 ) -> np.ndarray:
     """Return configurations within limits, (count, n), the base within `arena`, at any heading."""
-    low, high = np.maximum(lower, -np.pi), np.minimum(upper, np.pi)
-    low[:2], high[:2] = -arena, arena
+    low = np.maximum(lower, -np.pi)
+    high = np.minimum(upper, np.pi)
+    low[:2] = -arena
+    high[:2] = arena
     return rng.uniform(low, high, (count, len(low)))
 
 

@@ -30,7 +30,8 @@ def compute_support(shape: coal.CollisionGeometry, directions: Floats) -> Floats
         shape: A convex shape of coal.
         directions: Unit vectors, shape (n, 3).
     """
-    radial, axial = np.hypot(directions[:, 0], directions[:, 1]), np.abs(directions[:, 2])
+    radial = np.hypot(directions[:, 0], directions[:, 1])
+    axial = np.abs(directions[:, 2])
     match shape:
         case coal.Box():
             found = np.abs(directions) @ shape.halfSide
@@ -93,12 +94,15 @@ def find_widest_gap(
     rng = np.random.default_rng(0)
     best = -np.inf
     for direction in directions[np.argsort(-gaps)[:_STARTS]]:
-        here, gap, radius = direction, float(compute_gaps(*pair, direction[None])[0]), 0.05
+        here = direction
+        gap = float(compute_gaps(*pair, direction[None])[0])
+        radius = 0.05
         for _ in range(_ROUNDS):
             near = _normalize(here + radius * rng.normal(size=(_NEIGHBOURS, 3)))
             found = compute_gaps(*pair, near)
             if found.max() > gap:
-                here, gap = near[int(found.argmax())], float(found.max())
+                here = near[int(found.argmax())]
+                gap = float(found.max())
             else:
                 radius *= 0.7
         best = max(best, gap)

@@ -78,7 +78,8 @@ def write_telescope(
         format_link("carriage", "0.06 0.12 0.1"),
         format_joint("lift", "prismatic", "mast", "carriage", "0.08 0 0.1", "0 0 1", (0.0, 1.0)),
     ]
-    below, at = "carriage", "0.05 0 0"
+    below = "carriage"
+    at = "0.05 0 0"
     for k in range(1, 5):
         width = 0.1 - 0.018 * k
         leader = {"first": "out_1", "chain": f"out_{k - 1}"}.get(mimics, "") if k > 1 else ""
@@ -96,7 +97,8 @@ def write_telescope(
                 inside=inside,
             )
         )
-        below, at = f"segment_{k}", "0.005 0 0"
+        below = f"segment_{k}"
+        at = "0.005 0 0"
     for name, axis, at in (
         ("yaw", "0 0 1", "0.24 0 0"),
         ("pitch", "0 1 0", "0.05 0 0"),

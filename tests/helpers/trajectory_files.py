@@ -41,7 +41,9 @@ def trajectories(draw: st.DrawFn, largest: float | None = None) -> Trajectory:
         )
     )
     cuts = sorted(draw(st.sets(st.integers(1, len(steps)))) | {len(steps)})
-    label, phases, first = st.text(st.characters(exclude_categories=["Cs"]), max_size=6), [], 0
+    label = st.text(st.characters(exclude_categories=["Cs"]), max_size=6)
+    phases = []
+    first = 0
     name = st.text(st.characters(exclude_categories=["Cs"], exclude_characters="."), max_size=6)
     link = label.filter(bool)
     for last in cuts:

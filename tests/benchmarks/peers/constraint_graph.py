@@ -80,7 +80,8 @@ def plan_by_constraint_graph(
                 continue
             if found.first is None:
                 found.first = clock.cpu_time - answer["optimizing"]
-            found.path, found.status = np.array(answer["z"]), "found"
+            found.path = np.array(answer["z"])
+            found.status = "found"
             found.path[0] = problem.start
             if accept(found.path):
                 break

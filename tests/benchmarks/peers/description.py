@@ -7,6 +7,7 @@ shape is a link `shape_<number>`, so that pairs can be disabled and have own mar
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -23,7 +24,8 @@ from vkc_pin.world.files.hulls import compute_hull
 
 from .sampled import compute_finite_limits
 
-GROUP, FRAME = "chain", "goal_frame"
+GROUP = "chain"
+FRAME = "goal_frame"
 _AXES = {"X": (1.0, 0.0, 0.0), "Y": (0.0, 1.0, 0.0), "Z": (0.0, 0.0, 1.0)}
 _AROUND = 1.06  # radius of the corners of 42 that lie around a unit sphere
 _PLUGINS = "package://tesseract_support/urdf/contact_manager_plugins.yaml"  # of its wheel
@@ -60,32 +62,11 @@ def describe(problem: TrajectoryProblem, folder: Path, *, by_body: bool = False)
     Raises:
         InputError: The chain has a joint that URDF does not support.
     """
-    chain, (part,) = problem.chain, problem.contacts.phases
+    (part,) = problem.contacts.phases
     root = ET.Element("robot", {"name": "chain", "tesseract:make_convex": "true"})
     ET.SubElement(root, "link", name="world")
-    names = tuple(name.replace(".", "_") for name in chain.names)
-    lower, upper = compute_finite_limits(problem)
-    model, at = chain.model, 0
-    for j in range(1, model.njoints):
-        parent = f"body_{model.parents[j]}" if model.parents[j] else "world"
-        placement, moves = model.jointPlacements[j], _list_moves(model, j)
-        for k, (form, axis) in enumerate(moves):
-            child = f"body_{j}" + (f"_{k}" if k + 1 < len(moves) else "")
-            ET.SubElement(root, "link", name=child)
-            joint = _joint(root, names[at], form, parent, child, placement)
-            ET.SubElement(joint, "axis", xyz=_numbers(axis))
-            limits = {
-                "lower": lower[at],
-                "upper": upper[at],
-                "velocity": chain.velocity[at],
-                "effort": _EFFORT,
-            }
-            ET.SubElement(
-                joint, "limit", {name: repr(float(value)) for name, value in limits.items()}
-            )
-            parent, placement, at = child, pin.SE3.Identity(), at + 1
-    if at != len(names):
-        raise InputError("joints move together", field=", ".join(names))
+    names = tuple(name.replace(".", "_") for name in problem.chain.names)
+    _add_joints(root, problem, names)
     if problem.pose_goals:
         goal = problem.pose_goals[0].row
         ET.SubElement(root, "link", name=FRAME)
@@ -100,31 +81,70 @@ def describe(problem: TrajectoryProblem, folder: Path, *, by_body: bool = False)
     for (i, j), margin in margins.items():
         own = least[frozenset((part.joint[i], part.joint[j]))]
         rest = max(0.0, margin - own)
-        one, other = f"shape_{i}", _thick(j, rest)
+        one = f"shape_{i}"
+        other = _thick(j, rest)
         links |= {one: (i, 0.0), other: (j, rest)}
         kept[frozenset((one, other))] = own
     for name, (number, thicker) in links.items():
-        shape, link = part.shapes[number], ET.SubElement(root, "link", name=name)
+        shape = part.shapes[number]
+        link = ET.SubElement(root, "link", name=name)
         body = "world" if part.joint[number] == 0 else f"body_{part.joint[number]}"
         _joint(root, f"to_{name}", "fixed", body, name, shape.placement)
         _collision(link, shape.geometry, thicker, folder / f"{name}.stl")
+    moved = {name for name, (number, _) in links.items() if part.joint[number]}
+    unchecked = list[tuple[str, str]]()
+    for one, other in combinations(links, 2):
+        if frozenset((one, other)) not in kept and (one in moved or other in moved):
+            unchecked.append((one, other))
+    urdf = folder / "chain.urdf"
+    srdf = folder / "chain.srdf"
+    ET.ElementTree(root).write(urdf)
+    ET.ElementTree(_make_semantics(names, unchecked)).write(srdf)
+    margin_by_links = dict[tuple[str, str], float]()
+    for pair, own in kept.items():
+        one, other = sorted(pair)
+        margin_by_links[one, other] = own
+    return Description(urdf, srdf, names, margin_by_links)
+
+
+def _add_joints(root: ET.Element, problem: TrajectoryProblem, names: Sequence[str]) -> None:
+    """Add the bodies of a chain, and a joint for each of its coordinates."""
+    chain = problem.chain
+    model = chain.model
+    lower, upper = compute_finite_limits(problem)
+    at = 0
+    for j in range(1, model.njoints):
+        parent = f"body_{model.parents[j]}" if model.parents[j] else "world"
+        placement = model.jointPlacements[j]
+        moves = _list_moves(model, j)
+        for k, (form, axis) in enumerate(moves):
+            child = f"body_{j}" if k + 1 == len(moves) else f"body_{j}_{k}"
+            ET.SubElement(root, "link", name=child)
+            joint = _joint(root, names[at], form, parent, child, placement)
+            ET.SubElement(joint, "axis", xyz=_numbers(axis))
+            limit = ET.SubElement(joint, "limit")
+            limit.set("lower", repr(float(lower[at])))
+            limit.set("upper", repr(float(upper[at])))
+            limit.set("velocity", repr(float(chain.velocity[at])))
+            limit.set("effort", repr(_EFFORT))
+            parent = child
+            placement = pin.SE3.Identity()
+            at += 1
+    if at != len(names):
+        raise InputError("joints move together", field=", ".join(names))
+
+
+def _make_semantics(names: Sequence[str], unchecked: Sequence[tuple[str, str]]) -> ET.Element:
+    """Return an SRDF with a group of joints, and pairs of links that are not checked."""
     semantics = ET.Element("robot", name="chain")
     group = ET.SubElement(semantics, "group", name=GROUP)
     for name in names:
         ET.SubElement(group, "joint", name=name)
     # Tesseract cannot do without it.
     ET.SubElement(semantics, "contact_managers_plugin_config", filename=_PLUGINS)
-    for one, other in combinations(links, 2):
-        if frozenset((one, other)) not in kept and (
-            part.joint[links[one][0]] or part.joint[links[other][0]]
-        ):
-            ET.SubElement(semantics, "disable_collisions", link1=one, link2=other, reason="Never")
-    files = folder / "chain.urdf", folder / "chain.srdf"
-    for file, tree in zip(files, (root, semantics), strict=True):
-        ET.ElementTree(tree).write(file)
-    return Description(
-        *files, names, {(one, other): kept[pair] for pair in kept for one, other in [sorted(pair)]}
-    )
+    for one, other in unchecked:
+        ET.SubElement(semantics, "disable_collisions", link1=one, link2=other, reason="Never")
+    return semantics
 
 
 def _list_moves(model: Any, joint: int) -> list[tuple[str, tuple[float, ...]]]:

@@ -51,8 +51,10 @@ class Clock:
     """
 
     def __init__(self, limit: float) -> None:
-        self.limit, self.elsewhere = limit, 0.0
-        self._wall, self._cpu = time.perf_counter(), time.process_time()
+        self.limit = limit
+        self.elsewhere = 0.0
+        self._wall = time.perf_counter()
+        self._cpu = time.process_time()
 
     @property
     def cpu_time(self) -> float:
@@ -127,7 +129,8 @@ def compute_clearances(
 ) -> Mapping[str, float | None]:
     """Return the least distance of pairs at and between waypoints [m]; None above 0.1 m."""
     share = np.arange(1, _BETWEEN) / _BETWEEN
-    begins, lasts = trajectory.times[:-1, None], np.diff(trajectory.times)[:, None]
+    begins = trajectory.times[:-1, None]
+    lasts = np.diff(trajectory.times)[:, None]
     found: dict[str, float | None] = {}
     for name, times in (("at", trajectory.times), ("between", (begins + share * lasts).ravel())):
         z = trajectory.at(times)

@@ -25,8 +25,11 @@ class Solver:
         from pyhpp import constraints, core, manipulation
         from pyhpp.manipulation import urdf
 
-        self.pin, self.core, self.manipulation = pinocchio, core, manipulation
-        self.constraints, self.urdf = constraints, urdf
+        self.pin = pinocchio
+        self.core = core
+        self.manipulation = manipulation
+        self.constraints = constraints
+        self.urdf = urdf
         self.files: tuple[str, str] = ("", "")
 
     def __call__(self, ask: dict[str, Any]) -> dict[str, Any]:
@@ -75,7 +78,8 @@ class Solver:
         robot = self.robot = self.manipulation.Device("chain")
         anchored = robot, 0, "", "anchor"
         self.urdf.loadModel(*anchored, ask["urdf"], ask["srdf"], self.pin.SE3.Identity())
-        model, geometry = robot.model(), robot.geomModel()
+        model = robot.model()
+        geometry = robot.geomModel()
         joints = [model.getJointId(name) for name in ask["joints"]]
         self.columns = [model.idx_qs[joint] for joint in joints]
         for name, *bounds in zip(ask["joints"], ask["lower"], ask["upper"], strict=True):
@@ -91,7 +95,8 @@ class Solver:
         self.transition = graph.createTransition(state, state, "move", 1, state)
         if ask["target"] is not None:
             frame = model.frames[model.getFrameId(ask["frame"])]
-            target, all_six = np.array(ask["target"]), [True] * 6
+            target = np.array(ask["target"])
+            all_six = [True] * 6
             equal = self.constraints.ComparisonTypes()
             equal[:] = (self.constraints.ComparisonType.EqualToZero,) * 6
             closure = self.constraints.Implicit(

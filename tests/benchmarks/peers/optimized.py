@@ -48,7 +48,8 @@ def plan_by_trajopt(
     goals = sample_goals(problem, np.random.default_rng([seed, 1]), _ENDS)
     if not len(goals):
         return PeerResult(status="no configuration at the goal")
-    segments, found = problem.segments, PeerResult(status="not converged")
+    segments = problem.segments
+    found = PeerResult(status="not converged")
     lower, upper = compute_finite_limits(problem)
     goal = problem.pose_goals[0].row
     ask_worker = {
@@ -87,7 +88,8 @@ def plan_by_trajopt(
             answer = worker(ask)
             clock.elsewhere += answer["cpu"]
             if "error" in answer:
-                found.status, found.about["said"] = "error", answer["error"]
+                found.status = "error"
+                found.about["said"] = answer["error"]
                 continue
             found.own += answer["own"]
             found.about.setdefault("said", []).append(answer["status"])

@@ -57,7 +57,8 @@ def plan_by_projection(  # noqa: PLR0915 - sets up one planner, step by step
     constraints = []
     if held:
         tight = {"position_tolerance": 1e-4, "orientation_tolerance": 1e-4}
-        zeros, target = np.zeros(6), np.asfortranarray(problem.targets[0].homogeneous)
+        zeros = np.zeros(6)
+        target = np.asfortranarray(problem.targets[0].homogeneous)
         pose = rrt.PoseConstraint(scene, GROUP, FRAME, zeros, zeros, target, "", **tight)
         constraints.append(pose)
     found = PeerResult(status="no path")
@@ -97,7 +98,8 @@ def plan_by_projection(  # noqa: PLR0915 - sets up one planner, step by step
             found.own += time.process_time() - began
         rows = np.array(path.positions)[:, order]
         rows[0] = problem.start
-        found.path, found.status = subdivide(rows, problem.chain.metric), "found"
+        found.path = subdivide(rows, problem.chain.metric)
+        found.status = "found"
         if accept(found.path):
             break
     return found

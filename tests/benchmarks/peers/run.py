@@ -119,7 +119,8 @@ def run(
 
 def format_results(result: Mapping[str, Any]) -> str:
     """Return the table of a result in Markdown."""
-    about, records = result["meta"], result["trials"]
+    about = result["meta"]
+    records = result["trials"]
     rows = [
         _row(task, method, own)
         for task in about["tasks"]
@@ -176,8 +177,10 @@ def _record(spec: dict[str, Any], *, folder: str) -> dict[str, Any]:
         share = (took["time_casadi"] + took["time_ipopt"]) / (
             took["planning_time"] + took["build_time"]
         )
-        found.own, found.first = share * clock.cpu_time, clock.cpu_time if plan_of.success else None
-    spent, wall = clock.cpu_time, clock.wall
+        found.own = share * clock.cpu_time
+        found.first = clock.cpu_time if plan_of.success else None
+    spent = clock.cpu_time
+    wall = clock.wall
     if plan_of.status != "interrupted":
         Path(folder).mkdir(parents=True, exist_ok=True)
         plan_of.save(Path(folder) / f"{spec['key'].replace('/', '_')}.npz")

@@ -55,8 +55,10 @@ def plan_by_sampling(  # noqa: C901, PLR0915 - sets up one planner, step by step
     goals = sample_goals(problem, np.random.default_rng([seed, 1]), _ENDS)
     if not len(goals):
         return PeerResult(status="no configuration at the goal")
-    scale, held = problem.chain.metric, problem.is_closed(problem.task.phases[0])
-    size, middle = problem.chain.size, 1
+    scale = problem.chain.metric
+    held = problem.is_closed(problem.task.phases[0])
+    size = problem.chain.size
+    middle = 1
     lower, upper = compute_finite_limits(problem)
     space = ob.RealVectorStateSpace(size)
     bounds = ob.RealVectorBounds(size)
@@ -74,7 +76,8 @@ def plan_by_sampling(  # noqa: C901, PLR0915 - sets up one planner, step by step
         return np.array([state[k] for k in range(size)]) / scale
 
     if held:
-        solver, target = problem.transcription.pose_solvers[0], problem.targets[0]
+        solver = problem.transcription.pose_solvers[0]
+        target = problem.targets[0]
 
         class Closure(ob.Constraint):  # type: ignore[name-defined]
             def __init__(self) -> None:
@@ -91,13 +94,15 @@ def plan_by_sampling(  # noqa: C901, PLR0915 - sets up one planner, step by step
         information = ob.ConstrainedSpaceInformation(used)
         used.setDelta(_STEP)
     else:
-        used, information = space, ob.SpaceInformation(space)
+        used = space
+        information = ob.SpaceInformation(space)
     information.setStateValidityChecker(lambda state: bool(blocked(values(state)[None]) == 1))
     if not held:
 
         class Motions(ob.MotionValidator):  # type: ignore[name-defined]
             def checkMotion(self, one: Any, other: Any) -> bool:
-                a, b = values(one), values(other)
+                a = values(one)
+                b = values(other)
                 count = max(1, int(np.ceil(np.abs((b - a) * scale).max() / _STEP)))
                 z = a + (np.arange(1, count + 1) / count)[:, None] * (b - a)
                 return bool(blocked(z) == len(z))
@@ -117,7 +122,8 @@ def plan_by_sampling(  # noqa: C901, PLR0915 - sets up one planner, step by step
 
     if held:
         information.setup()
-    start, states = make_state(find_exact_start(problem)), [make_state(row) for row in goals]
+    start = make_state(find_exact_start(problem))
+    states = [make_state(row) for row in goals]
     if held:
         for state in (start, *states):
             used.anchorChart(state)
@@ -146,7 +152,8 @@ def plan_by_sampling(  # noqa: C901, PLR0915 - sets up one planner, step by step
         path.interpolate()
     rows = np.array([values(path.getState(k)) for k in range(path.getStateCount())])
     rows[0] = problem.start
-    found.path, found.status = subdivide(rows, scale), "found"
+    found.path = subdivide(rows, scale)
+    found.status = "found"
     return found
 
 

@@ -22,7 +22,8 @@ def test_description_has_the_same_kinematics_and_pairs(task: str, tmp_path: Path
     problem = build_program(make_problem(task, 18, 0))
     files = describe(problem, tmp_path)
     model = pin.buildModelFromUrdf(str(files.urdf))
-    data, order = model.createData(), [list(model.names)[1:].index(name) for name in files.joints]
+    data = model.createData()
+    order = [list(model.names)[1:].index(name) for name in files.joints]
     for row in sample_goals(problem, np.random.default_rng(0), 3):
         q = np.zeros(model.nq)
         q[order] = row
@@ -62,7 +63,8 @@ def test_shapes_violate_the_same_margins(by_body: bool, tmp_path: Path) -> None:
         data.collisionRequests[number].security_margin = margin
     order = [list(model.names)[1:].index(name) for name in files.joints]
     rng, lower, upper = np.random.default_rng(0), *compute_finite_limits(problem)
-    z, agreed = rng.uniform(lower, upper, (60, len(lower))), 0
+    z = rng.uniform(lower, upper, (60, len(lower)))
+    agreed = 0
     contacts = problem.contacts.evaluate(z, np.ones(len(z), int), reach=0.1)
     for row, configuration in enumerate(z):
         slack = (contacts.distance - contacts.margin)[contacts.waypoint == row].min(initial=0.1)

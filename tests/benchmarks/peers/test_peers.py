@@ -22,7 +22,8 @@ def find_peer(name: str) -> Peer:
 @pytest.mark.parametrize("task", ["reach", "drawer"])
 @pytest.mark.parametrize("name", PEERS)
 def test_peer_finds_a_valid_path(name: str, task: str) -> None:
-    plan_by_peer, peer_problem = find_peer(name), make_problem(task, 18, 0)
+    plan_by_peer = find_peer(name)
+    peer_problem = make_problem(task, 18, 0)
     problem = build_program(peer_problem)
 
     def accept(path: np.ndarray) -> bool:
@@ -39,7 +40,9 @@ def test_peer_finds_a_valid_path(name: str, task: str) -> None:
 
 @pytest.mark.parametrize("name", PEERS)
 def test_peer_ends_at_its_time_limit(name: str) -> None:
-    plan_by_peer, peer_problem = find_peer(name), make_problem("door", 20270430, 1)
-    problem, clock = build_program(peer_problem), Clock(1.5)
+    plan_by_peer = find_peer(name)
+    peer_problem = make_problem("door", 20270430, 1)
+    problem = build_program(peer_problem)
+    clock = Clock(1.5)
     plan_by_peer(peer_problem, problem, 0, clock, lambda path: False)
     assert clock.wall < 20.0

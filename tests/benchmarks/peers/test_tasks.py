@@ -14,7 +14,9 @@ from vkc_pin.planning.initialization.keyframes import compute_shortfall
     [task if task == "reach" else pytest.param(task, marks=pytest.mark.long) for task in TASKS],
 )
 def test_problems_are_reproducible_and_start_collision_free(task: str) -> None:
-    one, same, other = make_problem(task, 3, 1), make_problem(task, 3, 1), make_problem(task, 3, 2)
+    one = make_problem(task, 3, 1)
+    same = make_problem(task, 3, 1)
+    other = make_problem(task, 3, 2)
     assert np.array_equal(one.scene.start, same.scene.start)
     assert not np.array_equal(one.scene.start, other.scene.start)
     problem = build_program(one)

@@ -41,7 +41,8 @@ class Solver:
         """Return waypoints, status and time for one initial guess."""
         import numpy as np
 
-        ti, sqp = self.ti, self.sqp
+        ti = self.ti
+        sqp = self.sqp
         files = ask["urdf"], ask["srdf"]
         if self.files != files:
             locator = self.common.GeneralResourceLocator()
@@ -49,7 +50,9 @@ class Solver:
             texts = [Path(file).read_text(encoding="utf-8") for file in files]
             if not environment.initFromUrdfSrdf(*texts, locator):
                 return {"error": "the description is refused"}
-            self.files, self.environment, self.locator = files, environment, locator
+            self.files = files
+            self.environment = environment
+            self.locator = locator
         group = self.environment.getJointGroup(ask["group"])
         names = list(group.getJointNames())
         order = [ask["joints"].index(name) for name in names]
@@ -78,7 +81,8 @@ class Solver:
             # Weights of 0 are refused; these let the other joints be anywhere.
             asked = np.full(len(names), 1e-5)
             for name, value in ask["goal"].items():
-                goal[names.index(name)], asked[names.index(name)] = value, 5.0
+                goal[names.index(name)] = value
+                asked[names.index(name)] = 5.0
             constrain(ti.JointPosConstraint(goal, at[-1], asked, "goal"))
         for cost in (
             ti.JointVelConstraint(np.zeros(len(names)), at, weights, "velocity"),

@@ -153,9 +153,11 @@ def select_problems(problems: Sequence[int] | None) -> list[int]:
 
 def format_results(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown."""
-    about, records = result["meta"], result["trials"]
+    about = result["meta"]
+    records = result["trials"]
     base = {_which(record): record for record in select(records, method=str(UNCHANGED))}
-    rows, paired = [], []
+    rows = []
+    paired = []
     for change in about["changes"]:
         own = select(records, method=change)
         rows.append([change, *summary(own)])

@@ -62,7 +62,9 @@ def run(
 
 def format_results(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown."""
-    about, records, rows = result["meta"], result["trials"], []
+    about = result["meta"]
+    records = result["trials"]
+    rows = []
     for task in (*about["tasks"], "all"):
         own = records if task == "all" else select(records, task=task)
         first = sum(bool(record.get("first_seed")) for record in own)

@@ -55,7 +55,9 @@ def run(
 
 def format_results(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown."""
-    about, records, rows = result["meta"], result["trials"], []
+    about = result["meta"]
+    records = result["trials"]
+    rows = []
     fields = ("success", "explained", "proven")
     for kind in (*KINDS, "all"):
         own = records if kind == "all" else select(records, kind=kind)
@@ -91,7 +93,8 @@ def sample_impossible_problem(seed: int, number: int) -> _Problem:
 
 
 def _record(spec: dict[str, Any]) -> dict[str, Any]:
-    number, seed = spec["number"], spec["seed"]
+    number = spec["number"]
+    seed = spec["seed"]
     kind = list(KINDS)[number % len(KINDS)]
     scene, steps = sample_impossible_problem(seed, number)
     began = time.perf_counter()
@@ -187,7 +190,9 @@ def _fenced_out(rng: np.random.Generator) -> _Problem:
 
 
 def _narrow(rng: np.random.Generator) -> _Problem:
-    gap, y, x = _WIDTH - 0.05, float(rng.uniform(-2.0, 2.0)), float(rng.uniform(1.2, 1.8))
+    gap = _WIDTH - 0.05
+    y = float(rng.uniform(-2.0, 2.0))
+    x = float(rng.uniform(1.2, 1.8))
     ends = {"wall_left": (y + gap / 2, _HALL), "wall_right": (-_HALL, y - gap / 2)}
     walls = [
         _box(name, (0.2, high - low, 2.0), (x, (low + high) / 2))
@@ -198,7 +203,8 @@ def _narrow(rng: np.random.Generator) -> _Problem:
 
 def _bend(rng: np.random.Generator) -> _Problem:
     """Return a passage as wide as the base, with a corner too tight to turn in."""
-    x, width = float(rng.uniform(1.2, 1.4)), _WIDTH + 0.08
+    x = float(rng.uniform(1.2, 1.4))
+    width = _WIDTH + 0.08
     walls = [_box("wall_low", (2.0 + width, 0.1, 1.0), (x + 1.0 + width / 2, -width / 2 - 0.05))]
     walls += [_box("wall_high", (2.0, 0.1, 1.0), (x + 1.0, width / 2 + 0.05))]
     walls += [_box("wall_east", (0.1, 3.0 + width, 1.0), (x + 2.05 + width, 1.5))]

@@ -115,7 +115,8 @@ def _sample_pose(
 ) -> tuple[pin.SE3, Floats]:
     """Return tool placement and configuration, shape (n,), with a random arm posture."""
     robot = scene.robot
-    lower, upper = np.maximum(robot.lower, -np.pi)[3:], np.minimum(robot.upper, np.pi)[3:]
+    lower = np.maximum(robot.lower, -np.pi)[3:]
+    upper = np.minimum(robot.upper, np.pi)[3:]
     z = np.concatenate([base, rng.uniform(lower, upper)])
     data = robot.model.createData()
     pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(z))
@@ -125,7 +126,8 @@ def _sample_pose(
 def _free(scene: Scene, z: Floats, near: float = np.inf) -> bool:
     """Return whether the robot keeps `CLEAR` from everything, and is within `near` of the scene."""
     robot = scene.robot
-    data, shapes = robot.model.createData(), robot.collision.createData()
+    data = robot.model.createData()
+    shapes = robot.collision.createData()
     pin.updateGeometryPlacements(robot.model, data, robot.collision, shapes, robot.coordinates.q(z))
     geometry = robot.collision.geometryObjects
     for shape, where in zip(geometry, shapes.oMg, strict=True):

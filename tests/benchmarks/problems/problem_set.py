@@ -108,7 +108,8 @@ def _clutter(number: int) -> float:
 
 def _reach(number: int) -> tuple[Scene, Step, str]:
     layout = sample_layout(number, clutter=_clutter(number))
-    scene, rng = layout.make_scene(), np.random.default_rng([2, number])
+    scene = layout.make_scene()
+    rng = np.random.default_rng([2, number])
     over = number % 2 == 0
     pose: pin.SE3 = (
         sample_pose_over(layout, scene, layout.find_part("table_1"), rng)
@@ -138,7 +139,8 @@ def _pull(number: int) -> tuple[Scene, Step, str]:
 
 def _carry(number: int) -> tuple[Scene, Step, str]:
     layout = sample_layout(number, clutter=_clutter(number), tables=2, carried=("cup",))
-    rng, table = np.random.default_rng([2, number]), layout.find_part("table_2")
+    rng = np.random.default_rng([2, number])
+    table = layout.find_part("table_2")
     depth, width, _ = table.size
     x = -depth / 2.0 + float(rng.uniform(_EDGE, 0.3))
     y = float(rng.uniform(_EDGE - width / 2.0, width / 2.0 - _EDGE))

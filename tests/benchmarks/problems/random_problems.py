@@ -243,7 +243,9 @@ def run(
 
 def format_results(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown."""
-    about, records, rows = result["meta"], result["trials"], []
+    about = result["meta"]
+    records = result["trials"]
+    rows = []
     statuses = sorted({record["status"] for record in records} - {"success"})
     for kind in (*sorted({record["kind"] for record in records if "kind" in record}), "all"):
         own = records if kind == "all" else select(records, kind=kind)
@@ -272,7 +274,8 @@ def _in_a_room(seed: int, number: int) -> Problem:
 
 
 def _record(spec: dict[str, Any], *, folder: str) -> dict[str, Any]:
-    number, seed = spec["number"], spec["seed"]
+    number = spec["number"]
+    seed = spec["seed"]
     own = sample_problem(seed, number) if spec["of"] == OF[0] else _in_a_room(seed, number)
     found = plan(own.scene, own.steps, seed=seed, **_LIMITS)
     if found.status != "interrupted":

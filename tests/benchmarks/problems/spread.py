@@ -74,10 +74,12 @@ def compute_spread(records: Sequence[Record], field: str) -> float | None:
 
 def format_results(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown."""
-    about, records = result["meta"], result["trials"]
+    about = result["meta"]
+    records = result["trials"]
     groups = {number: select(records, number=number) for number in about["problems"]}
     whole = [own for own in groups.values() if all(r["success"] for r in own)]
-    summary, rows = [], []
+    summary = []
+    rows = []
     for field, name in FIELDS.items():
         found = [spread for own in whole if (spread := compute_spread(own, field)) is not None]
         late = float(np.percentile(found, 95)) if found else float("nan")

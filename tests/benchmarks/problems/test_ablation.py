@@ -56,6 +56,7 @@ def test_ratios_are_of_problems_that_both_settings_solve() -> None:
     text = ablation.format_results(
         {"meta": {**describe_environment(time_limit=1.0), **meta}, "trials": [*trials, error]}
     )
-    triple, same = "3.000 (3.000–3.000)", "1.000 (1.000–1.000)"
+    triple = "3.000 (3.000–3.000)"
+    same = "1.000 (1.000–1.000)"
     assert f"| {changed} | 1 | {triple} | {same} | {same} | – | {triple} |" in text
     assert "| unchanged | 2 of 4 | 2 of 4 | 1.00 | 1.33 |" in text

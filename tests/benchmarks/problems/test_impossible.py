@@ -25,7 +25,8 @@ def test_infeasibility_is_proven(kind: str) -> None:
 
 def test_problems_are_determined_by_their_numbers() -> None:
     for number in range(len(KINDS)):
-        one, other = sample_impossible_problem(7, number), sample_impossible_problem(7, number)
+        one = sample_impossible_problem(7, number)
+        other = sample_impossible_problem(7, number)
         assert one[0].document == other[0].document
         assert one[1][0].__class__ is other[1][0].__class__
 

@@ -27,7 +27,8 @@ def test_other_numbers_are_refused(number: int) -> None:
     ],
 )
 def test_problems_are_reproducible_and_can_be_compiled(number: int) -> None:
-    one, other = problem(number), problem(number)
+    one = problem(number)
+    other = problem(number)
     assert (one.number, one.kind, one.name) == (number, get_kind(number), other.name)
     assert one.scene.document == other.scene.document
     assert [str(step) for step in one.steps] == [str(step) for step in other.steps]

@@ -50,7 +50,8 @@ def test_plans_are_saved_and_judged(tmp_path: Path) -> None:
     plans = tmp_path / "plans"
     for trial in trials:
         path = plans / f"{trial['key']}.npz"
-        saved, problem = Plan.load(path), sample_problem(0, trial["number"])
+        saved = Plan.load(path)
+        problem = sample_problem(0, trial["number"])
         assert (saved.success, saved.status) == (trial["success"], trial["status"])
         assert saved.scene.document == problem.scene.document
         assert read_plan(path).steps == [step_to_dict(step) for step in saved.steps]

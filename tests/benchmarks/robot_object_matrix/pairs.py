@@ -69,7 +69,8 @@ SHARE = 0.5
 """Of a joint's range by which it is opened: the middle of what `random_task` draws."""
 
 _IT = "it"  # name of the object in its hall
-_SIZE, _HEIGHT = 8.0, 2.4  # inner length of the walls, and their height [m]
+_SIZE = 8.0  # [m] inner length of the walls
+_HEIGHT = 2.4  # [m] of the walls
 _FRONT = 3.0  # depth of the floor before the object that stays free [m]
 _BEYOND = 2.0  # of floor beyond a wall with a door [m]
 # [m]; the object is at x = 4 m at most, and any heading is allowed.
@@ -138,7 +139,8 @@ def load_description(name: str) -> dict[str, Any]:
 
 def make_hall(robot: str, name: str, description: Mapping[str, Any]) -> Scene:
     """Return a hall with a robot and an object, against a wall, in it, or on a counter."""
-    match, floor = _of_kind(name), Floor(_SIZE, _SIZE)
+    match = _of_kind(name)
+    floor = Floor(_SIZE, _SIZE)
     own = make_fixture(RANDOM + match[0], match[1]) if match else make_fixture(name)
     if _is_path(name) and own.high[2] - own.low[2] < _LOW:
         own = _on_a_counter(own)
@@ -180,7 +182,8 @@ def make_pair(robot: Robot, called: str, name: str, *, seed: int = 0) -> Pair:
     asked = _find_opening_steps(scene, proposals)
     if not asked:
         return Pair(scene, None, _why_not(proposals))
-    cache, said = Cache(), list[str]()
+    cache = Cache()
+    said = list[str]()
     for step in asked:
         blocked = _explain_blocked(scene, step, seed, cache)
         if blocked is not None:
@@ -297,7 +300,9 @@ def parse_requests(texts: Sequence[str], field: str, default: Sequence[str]) -> 
                 expected="a name, a path, name=path or name=path#link",
                 got=text,
             )
-        called, path, link = match["called"], match["path"], match["link"]
+        called = match["called"]
+        path = match["path"]
+        link = match["link"]
         found.append(Request(called or link or _name(path), path, link))
     names = [one.called for one in found]
     if not names or len(set(names)) < len(names):
@@ -373,7 +378,8 @@ def _face(imported: ImportedObject) -> None:
     """Turn an object by quarter turns so that the best proposed hand approaches along x."""
     if not imported.proposals.found:
         return
-    item, best = imported.proposals.object, imported.proposals.found[0].attachment
+    item = imported.proposals.object
+    best = imported.proposals.found[0].attachment
     closed = np.clip(0.0, item.lower, item.upper)
     x, y, _ = (item.link_placement(best.link, closed) * best.placement).rotation[:, 2].tolist()
     quarters = round(-float(np.arctan2(y, x)) / (np.pi / 2.0)) % 4

@@ -107,7 +107,8 @@ def sample_reachable_poses(robot: Robot, name: str, number: int, *, seed: int = 
     rng = np.random.default_rng([11, seed, zlib.crc32(name.encode())])
     low = np.where(np.isfinite(robot.lower), robot.lower, -np.pi)
     high = np.where(np.isfinite(robot.upper), robot.upper, np.pi)
-    low[:3], high[:3] = (-_AWAY, -_AWAY, -np.pi), (_AWAY, _AWAY, np.pi)
+    low[:3] = (-_AWAY, -_AWAY, -np.pi)
+    high[:3] = (_AWAY, _AWAY, np.pi)
     clearances = Clearances(robot)
     data = robot.model.createData()
     frame = robot.model.getFrameId(robot.tool_frame)
@@ -175,7 +176,8 @@ def run(
 
 def format_results(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown."""
-    about, records = result["meta"], result["trials"]
+    about = result["meta"]
+    records = result["trials"]
     failed = [
         [r["robot"], str(r["status"]), r.get("because") or "; ".join(r.get("violations", ())[:1])]
         for r in records
@@ -214,7 +216,8 @@ def _row(name: str, own: Sequence[Record]) -> list[str]:
 
 def _files(robots: Sequence[str]) -> dict[str, Path]:
     """Return name → file of each robot; files of one name are prefixed by their folders."""
-    known, found = list_robots(), list[tuple[str, Path]]()
+    known = list_robots()
+    found = list[tuple[str, Path]]()
     for robot in map(str, robots):
         path = Path(robot)
         if path.suffix.lower() in _FORMATS:
@@ -246,7 +249,8 @@ def _files(robots: Sequence[str]) -> dict[str, Path]:
 
 def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:
     """Return a record of every pose, or one if the robot is unusable."""
-    seed, name = spec["seed"], spec["robot"]
+    seed = spec["seed"]
+    name = spec["robot"]
     folder = Path(spec["out"]) / "robots" / check_name(name, "robots")
     about: dict[str, Any] = {"robot": name}
     with warnings.catch_warnings():

@@ -57,7 +57,8 @@ _UNREACHED = ("unreachable", "no hand")
 
 def format_results(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown."""
-    about, records = result["meta"], result["trials"]
+    about = result["meta"]
+    records = result["trials"]
     groups = _groups(records)
     robots, objects = (list(dict.fromkeys(key[k] for key in groups)) for k in (0, 1))
     rows = [[name, *(_cell(groups.get((robot, name), ())) for robot in robots)] for name in objects]
@@ -213,7 +214,8 @@ def run(
 
 def _records(spec: dict[str, Any]) -> list[dict[str, Any]]:
     """Return a record of every start, or one if the object is unreachable."""
-    seed, (file, object_file) = spec["seed"], spec["files"]
+    seed = spec["seed"]
+    file, object_file = spec["files"]
     about: dict[str, Any] = {
         "robot": spec["robot"],
         "object": spec["object"],

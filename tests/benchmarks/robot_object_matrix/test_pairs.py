@@ -40,7 +40,8 @@ def husky() -> vkc.Robot:
 
 def test_description_does_not_depend_on_its_source() -> None:
     stored = find_resource_folder("scenes") / "objects" / "narrow_door.yaml"
-    by_name, by_path = load_description("narrow_door"), load_description(str(stored))
+    by_name = load_description("narrow_door")
+    by_path = load_description(str(stored))
     assert by_name == by_path
     assert Path(by_name["urdf"]).is_absolute()
     assert vkc.load_object(by_name).name == "narrow_door"
@@ -203,7 +204,8 @@ def test_object_file_is_imported_once_and_faces_the_robot(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("link", ["../../evil", "..", "a/b", "/evil", ".hidden"])
 def test_link_name_must_be_a_file_name(tmp_path: Path, link: str) -> None:
-    file, objects = tmp_path / "flat.urdf", tmp_path / "a" / "objects"
+    file = tmp_path / "flat.urdf"
+    objects = tmp_path / "a" / "objects"
     file.write_text(DESK.replace("case", link), encoding="utf-8")
     wrong, right = parse_requests([f"{file}#{link}", f"desk={file}#{link}"], "objects", ())
     with pytest.raises(vkc.InputError, match="objects: not a plain file name"):

@@ -21,7 +21,8 @@ def make_record(robot: str, name: str, status: str = "success", **fields: Any) -
     return {**record, **fields}
 
 
-NO_GRASP, NO_HAND = "turn: nothing of it fits", "touch_links: not known"
+NO_GRASP = "turn: nothing of it fits"
+NO_HAND = "touch_links: not known"
 RECORDS = [
     make_record("one", "oven_0", planning_time=1.0),
     make_record("one", "oven_0", planning_time=3.0),

@@ -244,9 +244,9 @@ def test_obstruction_is_named() -> None:
 @settings(max_examples=20, deadline=None)
 @given(st.integers(1, 400))
 def test_lines_are_checked_everywhere_and_far_apart_first(count: int) -> None:
-    shares = open_trees._order_shares(count)
-    np.testing.assert_allclose(np.sort(shares), np.arange(1, count + 1) / count)
-    gaps = np.diff(np.sort([0.0, *shares[: count // 2 + 1]]))
+    fractions = open_trees._order_fractions(count)
+    np.testing.assert_allclose(np.sort(fractions), np.arange(1, count + 1) / count)
+    gaps = np.diff(np.sort([0.0, *fractions[: count // 2 + 1]]))
     assert gaps.max() <= 3.0 / max(count // 2, 1)
 
 

@@ -33,7 +33,9 @@ DIRECTIONS = np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
 _AXES = slice(0, len(DIRECTIONS), len(DIRECTIONS) // 4)  # those of `DIRECTIONS` along world axes
 _RIM_ANGLES = 2 * np.pi * np.arange(16) / 16  # corners that approximate a circle
 _CORNERS = np.array(list(itertools.product((False, True), repeat=3)))  # of a box: upper ends or not
-_STEP, _ARC = 0.25, 0.13  # [m], [rad] above which motions are halved before coal is called
+# lengths of motions above which they are halved before coal is called
+_STEP = 0.25  # [m]
+_ARC = 0.13  # [rad]
 _LONG_ARC = 0.5  # [rad] of turning that one row of bounds may cover
 # [m] minimum advance between distance queries: half of it is the largest undetected violation
 _MIN_ADVANCE = 2e-3
@@ -61,7 +63,8 @@ class Obstacles:
         for s, (shape, placement) in enumerate(shapes):
             points, radius = compute_hull_points(shape, placement, outer=True)
             self.support[s] = (points[:, :2] @ DIRECTIONS.T).max(axis=0) + radius
-            self.height[s] = points[:, 2].min() - radius, points[:, 2].max() + radius
+            z = points[:, 2]
+            self.height[s] = (z.min() - radius, z.max() + radius)
         self.extent = self.support[:, _AXES].copy()
 
 
@@ -75,25 +78,29 @@ class MovingShapes:
     """
 
     def __init__(self, shapes: Sequence[Shape], world: Obstacles, margin: float) -> None:
-        self.world, self.margin = world, margin
+        self.world = world
+        self.margin = margin
         self.solids = [(convert_solid(shape), placement) for shape, placement in shapes]
-        outlines = [compute_hull_points(*placed, outer=True) for placed in shapes]
-        radius = np.array([radius for _, radius in outlines])
-        low = np.array([points[:, 2].min() for points, _ in outlines]) - radius
-        high = np.array([points[:, 2].max() for points, _ in outlines]) + radius
-        self.reach = np.array([np.hypot(*points[:, :2].T).max() for points, _ in outlines]) + radius
+        hulls = [compute_hull_points(shape, placement, outer=True) for shape, placement in shapes]
+        points_of_shapes = [points for points, _ in hulls]
+        radius = np.array([radius for _, radius in hulls])
+        low = np.array([points[:, 2].min() for points in points_of_shapes]) - radius
+        high = np.array([points[:, 2].max() for points in points_of_shapes]) + radius
+        distances = [np.hypot(points[:, 0], points[:, 1]) for points in points_of_shapes]
+        self.reach = np.array([from_axis.max() for from_axis in distances]) + radius
+        # Pairs of shapes and obstacles at the same height.
         gaps = np.maximum(low[:, None] - world.height[:, 1], world.height[:, 0] - high[:, None])
-        self.moving, self.standing = np.nonzero(gaps < margin)
+        self.moving, self.obstacle = np.nonzero(gaps < margin)
         self.exclusion_radius = np.full(len(world.solids), -np.inf)
-        np.maximum.at(self.exclusion_radius, self.standing, self.reach[self.moving] + margin)
-        self._points = np.concatenate(
-            [np.empty((0, 2)), *(points[:, :2] for points, _ in outlines)]
-        )
-        self._first_point = np.cumsum([0, *(len(points) for points, _ in outlines)])[:-1]
+        np.maximum.at(self.exclusion_radius, self.obstacle, self.reach[self.moving] + margin)
+        plan_views = [points[:, :2] for points in points_of_shapes]
+        self._points = np.concatenate([np.empty((0, 2)), *plan_views])
+        counts = [len(points) for points in points_of_shapes]
+        self._first_point = np.cumsum([0, *counts])[:-1]
         self._radius = radius[:, None]
         self._tables: dict[tuple[float, float], Floats] = {}
-        order = np.argsort(self.standing, kind="stable")
-        edges = np.searchsorted(self.standing[order], np.arange(1, len(world.solids)))
+        order = np.argsort(self.obstacle, kind="stable")
+        edges = np.searchsorted(self.obstacle[order], np.arange(1, len(world.solids)))
         self._pairs_by_obstacle = np.split(order, edges)
         self._margins = np.full(len(world.solids), margin)
 
@@ -103,11 +110,12 @@ class MovingShapes:
         """Return whether the margins are kept along a line; see `BaseGrid.is_drive_free`."""
         if not len(self.moving):
             return True
-        margins = self._margins if margins is None else margins
         rows = self._find_close_pairs(np.minimum(DIRECTIONS @ a, DIRECTIONS @ b))
-        return not len(rows) or self._check_drive(
-            a, b, yaw, extents=self._compute_extents(yaw, yaw, rows), rows=rows, margins=margins
-        )
+        if not len(rows):
+            return True
+        margins = self._margins if margins is None else margins
+        extents = self._compute_extents(yaw, yaw, rows)
+        return self._check_drive(a, b, yaw, extents=extents, rows=rows, margins=margins)
 
     def is_turn_free(
         self, at: Floats, start: float, end: float, margins: Floats | None = None
@@ -117,21 +125,24 @@ class MovingShapes:
             return True
         along = DIRECTIONS @ at
         rows = self._find_close_pairs(along)
+        if not len(rows):
+            return True
+        margins = self._margins if margins is None else margins
         parts = max(1, int(np.ceil(abs(end - start) / _LONG_ARC)))
         yaws = np.linspace(start, end, 1 + parts).tolist()
-        margins = self._margins if margins is None else margins
-        return not len(rows) or all(
-            self._check_turn(at, along, p, q, rows=rows, margins=margins)
-            for p, q in itertools.pairwise(yaws)
-        )
+        for before, after in itertools.pairwise(yaws):
+            if not self._check_turn(at, along, before, after, rows=rows, margins=margins):
+                return False
+        return True
 
     def compute_exit_margins(self, at: Floats, yaw: float) -> Floats:
         """Return the margins that hold at a pose; see `BaseGrid.compute_exit_margins`."""
         margins = self._margins.copy()
         for row in self._find_close_pairs(DIRECTIONS @ at).tolist():
             distance, _ = self._compute_distance(row, at, yaw)
-            least = distance - _ROUNDING if distance > 0.0 else -np.inf
-            margins[self.standing[row]] = min(margins[self.standing[row]], least)
+            largest = distance - _ROUNDING if distance > 0.0 else -np.inf
+            obstacle = self.obstacle[row]
+            margins[obstacle] = min(margins[obstacle], largest)
         return margins
 
     def _find_close_pairs(self, along: Floats) -> Ints:
@@ -144,20 +155,28 @@ class MovingShapes:
         return np.sort(np.concatenate([self._pairs_by_obstacle[s] for s in near.tolist()]))
 
     def _compute_extents(self, start: float, end: float, rows: Ints) -> Floats:
-        """Return upper bounds of the extents of pairs against `DIRECTIONS`, shape (n, 32) [m]."""
-        moving, support = self.moving[rows], self.world.support[self.standing[rows]]
+        """Return upper bounds of the extents of pairs against `DIRECTIONS`, shape (n, 32) [m].
+
+        While turning from yaw `start` to `end` the extent of a shape exceeds that at the nearest of
+        both ends and the middle, at most a quarter of the turn away, by no more than its reach
+        times 1 − cos of that quarter.
+        """
+        moving = self.moving[rows]
+        support = self.world.support[self.obstacle[rows]]
         extents = self._get_extent_table(start, end)[moving] + support
         if start == end:
             return extents
-        return extents + (self.reach * (1.0 - np.cos((end - start) / 4)))[moving, None]
+        growth = self.reach * (1.0 - np.cos((end - start) / 4))
+        return extents + growth[moving, None]
 
     def _get_extent_table(self, start: float, end: float) -> Floats:
         """Return upper bounds of the shapes' extents between two yaws, shape (M, 32) [m]."""
         key = (start, end)
         if key not in self._tables:
             if start == end:
-                cosine, sine = np.cos(start), np.sin(start)
-                # against u, in the base's frame
+                cosine = np.cos(start)
+                sine = np.sin(start)
+                # −u for each direction u, in the base's frame
                 turned = DIRECTIONS @ np.array([[-cosine, sine], [-sine, -cosine]])
                 along = self._points @ turned.T
                 table = np.maximum.reduceat(along, self._first_point, axis=0) + self._radius
@@ -172,19 +191,26 @@ class MovingShapes:
     def _check_drive(
         self, a: Floats, b: Floats, yaw: float, *, extents: Floats, rows: Ints, margins: Floats
     ) -> bool:
-        """Return whether pairs `rows` keep their margins along a line, given their extents."""
+        """Return whether pairs `rows` keep their margins along a line, given their extents.
+
+        Along a unit vector u, a shape at the base position p is at least u·p − e away from its
+        obstacle, with the extent e of the pair; on a line this is least at one of its ends.
+        """
         gaps = (np.minimum(DIRECTIONS @ a, DIRECTIONS @ b) - extents).max(axis=1)
-        near = gaps < margins[self.standing[rows]]
-        rows, extents = rows[near], extents[near]
+        is_near = gaps < margins[self.obstacle[rows]]
+        rows = rows[is_near]
+        extents = extents[is_near]
         if not len(rows):
             return True
         length = float(np.hypot(*(b - a)))
         if length > _STEP:
-            ends = itertools.pairwise((a, (a + b) / 2, b))
-            return all(
-                self._check_drive(*half, yaw, extents=extents, rows=rows, margins=margins)
-                for half in ends
-            )
+            middle = (a + b) / 2
+            for begin, end in ((a, middle), (middle, b)):
+                if not self._check_drive(
+                    begin, end, yaw, extents=extents, rows=rows, margins=margins
+                ):
+                    return False
+            return True
         direction = (b - a) / max(length, 1e-12)
 
         def query(row: int, at: float) -> tuple[float, float]:
@@ -200,15 +226,16 @@ class MovingShapes:
     ) -> bool:
         """Return whether pairs `rows` keep their margins during a turn, given `DIRECTIONS` @ at."""
         gaps = (along - self._compute_extents(start, end, rows)).max(axis=1)
-        rows = rows[gaps < margins[self.standing[rows]]]
+        rows = rows[gaps < margins[self.obstacle[rows]]]
         if not len(rows):
             return True
         angle = abs(end - start)
         if angle > _ARC:
-            ends = itertools.pairwise((start, (start + end) / 2, end))
-            return all(
-                self._check_turn(at, along, *half, rows=rows, margins=margins) for half in ends
-            )
+            middle = (start + end) / 2
+            for before, after in ((start, middle), (middle, end)):
+                if not self._check_turn(at, along, before, after, rows=rows, margins=margins):
+                    return False
+            return True
 
         def query(row: int, turned: float) -> tuple[float, float]:
             yaw = start + np.copysign(turned, end - start)
@@ -231,27 +258,30 @@ class MovingShapes:
     ) -> bool:
         """Return whether a pair keeps its margin, by conservative advancement.
 
-        `query` returns the distance [m] and a bound of the closing speed at some progress.
+        A pair at a distance d from which it closes at no more than the speed v keeps its margin m
+        for another (d − m)/v. `query` returns d [m] and v at some progress.
         """
-        at, margin = 0.0, margins[self.standing[row]]
+        at = 0.0
+        margin = margins[self.obstacle[row]]
         while True:
             distance, speed = query(row, at)
             if distance < margin:
                 return False
-            sure = (distance - margin) / max(speed, 1e-9)
-            if at >= end or at + sure >= end:
+            certain_advance = (distance - margin) / max(speed, 1e-9)
+            if at >= end or at + certain_advance >= end:
                 return True
-            at = min(at + max(sure, advance), end)
+            at = min(at + max(certain_advance, advance), end)
 
     def _compute_distance(self, row: int, at: Floats, yaw: float) -> tuple[float, Floats]:
         """Return the distance of a pair at a base pose [m], and its normal in the plane, (2,)."""
         solid, placement = self.solids[self.moving[row]]
-        cosine, sine = math.cos(yaw), math.sin(yaw)
+        cosine = math.cos(yaw)
+        sine = math.sin(yaw)
         turned = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
         moved = pin.SE3(turned, np.array([at[0], at[1], 0.0])) * placement
         where = flatten_placements([moved])[0]
-        standing = self.world.solids[self.standing[row]]
-        distance, normal = compute_distance(solid, where, *standing)
+        obstacle, obstacle_placement = self.world.solids[self.obstacle[row]]
+        distance, normal = compute_distance(solid, where, obstacle, obstacle_placement)
         return distance, normal[:2]
 
 

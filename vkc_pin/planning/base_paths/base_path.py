@@ -48,7 +48,8 @@ def shortest_path(
     additional costs of the goals. `smooth`: shorten the path where it turns more often than
     necessary.
     """
-    begin, ends = np.asarray(start, float), np.asarray(goals, float)
+    begin = np.asarray(start, float)
+    ends = np.asarray(goals, float)
     extra = np.zeros(len(ends)) if costs is None else np.asarray(costs, float)
     space = SearchSpace(grid, begin, ends)
     found = find_cheapest_path(space, extra)
@@ -66,47 +67,65 @@ def sample_poses(path: BasePath, steps: int, *, turning: float) -> Floats:
     `turning` is the cost of turning, relative to driving [m/rad].
     """
     change = np.diff(path.poses, axis=0)
-    passed = np.concatenate(
-        [[0.0], np.cumsum(np.hypot(change[:, 0], change[:, 1]) + turning * np.abs(change[:, 2]))]
-    )
-    u = np.arange(1, steps + 1) / steps
-    at = passed[-1] * (3.0 - 2.0 * u) * u**2
+    cost = np.hypot(change[:, 0], change[:, 1]) + turning * np.abs(change[:, 2])
+    passed = np.concatenate([[0.0], np.cumsum(cost)])
+    s = np.arange(1, steps + 1) / steps
+    at = passed[-1] * (3.0 - 2.0 * s) * s**2
     poses = np.column_stack([np.interp(at, passed, column) for column in path.poses.T])
     poses[-1] = path.poses[-1]
     return poses
 
 
 def _shorten(space: SearchSpace, drives: list[Drive], last: float) -> tuple[list[Drive], float]:
-    """Replace drives by straight shortcuts where those are free and cheaper."""
-    forced = 0 if space.exit_margins is None else 1  # the first drive leaves a blocked start
-    result, yaw = drives[:forced], drives[0].yaw if forced else float(space.start[2])
-    rest = []
-    for drive in drives[forced:]:
-        points = np.linspace(drive.a, drive.b, 1 + max(1, int(drive.length / _SHORTCUT_SPACING)))
+    """Replace drives by straight shortcuts where those are free and cheaper.
+
+    From each point on, a binary search finds the furthest end of a shortcut: where one is free,
+    further ones are tried, otherwise nearer ones.
+
+    Returns:
+        The drives, and the yaw at the goal [rad].
+    """
+    result = list[Drive]()
+    yaw = float(space.start[2])
+    if space.exit_margins is not None:  # the first drive leaves a blocked start
+        result, drives = drives[:1], drives[1:]
+        yaw = result[0].yaw
+    rest = list[Drive]()
+    for drive in drives:
+        parts = max(1, int(drive.length / _SHORTCUT_SPACING))
+        points = np.linspace(drive.a, drive.b, 1 + parts)
         rest += [Drive(a, b, drive.yaw) for a, b in itertools.pairwise(points)]
     while rest:
         yaws = np.array([yaw, *(drive.yaw for drive in rest), last])
         turns = space.grid.turning * np.abs(np.diff(yaws))
         # cost up to the end of each drive, including the turn to the next
         cost = turns[0] + np.cumsum([drive.cost for drive in rest] + turns[1:])
-        best, low, high = None, 1, len(rest)
+        best = None
+        low = 1  # drives that the best shortcut replaces
+        high = len(rest)
         tried = high
         while low < tried:
-            turns_to, limit = float(yaws[tried + 1]), float(cost[tried - 1])
-            straight = _find_shortcut(
-                space, rest[0].a, rest[tried - 1].b, before=yaw, after=turns_to, limit=limit
+            shortcut = _find_shortcut(
+                space,
+                rest[0].a,
+                rest[tried - 1].b,
+                before=yaw,
+                after=float(yaws[tried + 1]),
+                limit=float(cost[tried - 1]),
             )
-            if straight is None:
+            if shortcut is None:
                 high = tried - 1
             else:
-                best, low = straight, tried
+                best = shortcut
+                low = tried
             tried = (low + high + 1) // 2
         after = float(yaws[low + 1])
         drive, end = best or (rest[0], after)
         result.append(drive)
         # The same turns from there on, relative to an equivalent angle.
         rest = [Drive(other.a, other.b, other.yaw + end - after) for other in rest[low:]]
-        yaw, last = drive.yaw, last + end - after
+        yaw = drive.yaw
+        last = last + end - after
     return result, last
 
 
@@ -116,44 +135,53 @@ def _find_shortcut(
     """Return a straight drive between points, and the yaw after it, if it is free and cheap."""
     if np.hypot(*(b - a)) < _SAME:
         return None
-    found = []
-    for backwards in (0.0, np.pi):
-        yaw = float(before + wrap_angle(np.arctan2(b[1] - a[1], b[0] - a[0]) + backwards - before))
-        drive, end = Drive(a, b, yaw), float(yaw + wrap_angle(after - yaw))
+    direction = np.arctan2(b[1] - a[1], b[0] - a[0])
+    candidates = []
+    for reversal in (0.0, np.pi):  # ahead, backwards
+        yaw = float(before + wrap_angle(direction + reversal - before))
+        drive = Drive(a, b, yaw)
+        end = float(yaw + wrap_angle(after - yaw))
         cost = drive.cost + space.grid.turning * (abs(yaw - before) + abs(end - yaw))
-        found.append((cost, backwards, drive, end))
-    cost, _, drive, end = min(found)
-    is_useful = (
-        cost < limit - _SAME and space.looks_free(drive) and space.is_sweep_free(before, drive, end)
-    )
-    return (drive, end) if is_useful else None
+        candidates.append((cost, reversal, drive, end))
+    cost, _, drive, end = min(candidates)
+    if cost >= limit - _SAME:
+        return None
+    if space.looks_free(drive) and space.is_sweep_free(before, drive, end):
+        return drive, end
+    return None
 
 
 def _assemble(
     space: SearchSpace, drives: list[Drive], last: float, goal: int, extra: float
 ) -> BasePath:
     """Make a path of drives, merging those in line; `last` is the yaw at the goal [rad]."""
-    merged: list[Drive] = []
-    for drive in drives:
-        combined = Drive(merged[-1].a, drive.b, drive.yaw) if merged else drive
-        if (
-            merged
-            and merged[-1].yaw == drive.yaw
-            and combined.length >= merged[-1].length + drive.length - _SAME
-        ):
-            merged[-1] = combined
-        else:
-            merged.append(drive)
-    turns = float(np.rint((last - space.goals[goal, 2]) / (2 * np.pi)))
-    end = space.goals[goal] + [0.0, 0.0, 2 * np.pi * turns]
+    full_turns = float(np.rint((last - space.goals[goal, 2]) / (2 * np.pi)))
+    end = space.goals[goal] + [0.0, 0.0, 2 * np.pi * full_turns]
+    candidates = []
+    for drive in _merge_drives(drives):
+        candidates.append(np.array([*drive.a, drive.yaw]))
+        candidates.append(np.array([*drive.b, drive.yaw]))
+    candidates.append(end)
     poses = [space.start]
-    for pose in [
-        *(np.array([*place, drive.yaw]) for drive in merged for place in (drive.a, drive.b)),
-        end,
-    ]:
+    for pose in candidates:
         if np.abs(pose - poses[-1]).max() > _SAME:
             poses.append(pose)
+    # The goal is exact.
     poses = [*poses[:-1], end] if len(poses) > 1 else [space.start, end]
     turned = sum(abs(b[2] - a[2]) for a, b in itertools.pairwise(poses))
     cost = sum(drive.cost for drive in drives) + space.grid.turning * turned + extra
     return BasePath(np.array(poses), goal, float(cost))
+
+
+def _merge_drives(drives: list[Drive]) -> list[Drive]:
+    """Merge consecutive drives in line."""
+    merged: list[Drive] = []
+    for drive in drives:
+        if merged and merged[-1].yaw == drive.yaw:
+            last = merged[-1]
+            combined = Drive(last.a, drive.b, drive.yaw)
+            if combined.length >= last.length + drive.length - _SAME:
+                merged[-1] = combined
+                continue
+        merged.append(drive)
+    return merged

@@ -22,7 +22,8 @@ HEADINGS = 16
 _CELL_MOVES = np.array([(1, 0), (2, 1), (1, 1), (1, 2), (0, 1), (-1, 2), (-1, 1), (-2, 1)])
 _CELL_MOVES = np.concatenate([_CELL_MOVES, -_CELL_MOVES])  # by heading, in cells
 _FREE, _FORWARD, _LEFT = range(3)  # queries: a cell, the move ahead, the left turn
-_DEFAULT_CELLS, _MAX_CELLS = 100, 250  # along a side
+_DEFAULT_CELLS = 100  # along a side
+_MAX_CELLS = 250  # along a side
 _MAX_CLEARANCE = 0.5  # [m] above which more clearance makes no difference
 
 
@@ -59,7 +60,7 @@ class BaseGrid:
         self,
         base: Sequence[Shape],
         carried: Sequence[Shape],
-        standing: Sequence[Shape],
+        obstacles: Sequence[Shape],
         arena: Sequence[float],
         margin: float,
         *,
@@ -73,7 +74,7 @@ class BaseGrid:
         Args:
             base: Convex shapes of the base, in its frame.
             carried: Convex shapes of arm and load in their carrying posture, in the base's frame.
-            standing: Convex obstacles without the floor, in the world.
+            obstacles: Convex obstacles without the floor, in the world.
             arena: x_min, x_max, y_min, y_max [m]; the base's origin stays inside.
             margin: Clearance to keep [m].
             cells: Number of cells along each side.
@@ -81,22 +82,25 @@ class BaseGrid:
             turning: See `turning`.
             cache: Cache of support functions. Default: none.
         """
-        low, high = np.array(arena[::2], float), np.array(arena[1::2], float)
-        self.cells, self.near, self.turning = int(cells), float(near), float(turning)
+        low = np.array(arena[::2], float)
+        high = np.array(arena[1::2], float)
+        self.cells = int(cells)
+        self.near = float(near)
+        self.turning = float(turning)
         self.step = (high - low) / cells
         self.origin = low + self.step / 2
         self.moves = _CELL_MOVES
-        self.yaws = np.arctan2(
-            _CELL_MOVES[:, 1] * self.step[1], _CELL_MOVES[:, 0] * self.step[0]
-        ) % (2 * np.pi)
-        self.lengths = np.hypot(*(_CELL_MOVES * self.step).T)
-        world = Obstacles(standing)
+        dx = _CELL_MOVES[:, 0] * self.step[0]
+        dy = _CELL_MOVES[:, 1] * self.step[1]
+        self.yaws = np.arctan2(dy, dx) % (2 * np.pi)
+        self.lengths = np.hypot(dx, dy)
+        world = Obstacles(obstacles)
         self.base = MovingShapes(base, world, margin)
         self.carried = MovingShapes(carried, world, margin)
         views = (cache or Cache()).get("plan views", SupportCache)
         lattice = Lattice(self.origin, self.step, self.cells, self.yaws)
         self.blocked, self.carried_blocked = find_colliding_cells(
-            base, carried, standing, lattice, margin, views=views
+            base, carried, obstacles, lattice, margin, views=views
         )
         self.turn_limits: dict[tuple[bytes, bool, bytes | None], tuple[float, float]] = {}
         # Cached answers for everything and for the base alone; -1: not checked yet.
@@ -105,35 +109,36 @@ class BaseGrid:
 
     def center(self, i: int, j: int) -> tuple[float, float]:
         """Return the world position of a cell's centre [m]."""
-        return float(self.origin[0] + i * self.step[0]), float(self.origin[1] + j * self.step[1])
+        x = float(self.origin[0] + i * self.step[0])
+        y = float(self.origin[1] + j * self.step[1])
+        return x, y
 
     def find_cells_within(self, x: float, y: float, radius: float) -> Ints:
         """Return the cells whose centres are within `radius` [m] of a place, shape (C, 2)."""
         place = np.array([x, y])
         low = np.maximum(np.ceil((place - radius - self.origin) / self.step), 0)
         high = np.minimum(np.floor((place + radius - self.origin) / self.step), self.cells - 1) + 1
-        ranges = (np.arange(*ends) for ends in zip(low.astype(int), high.astype(int), strict=True))
-        i, j = (grid.ravel() for grid in np.meshgrid(*ranges, indexing="ij"))
-        inside = (
-            np.hypot(self.origin[0] + i * self.step[0] - x, self.origin[1] + j * self.step[1] - y)
-            <= radius
-        )
-        return np.column_stack([i[inside], j[inside]])
+        first_i, first_j = low.astype(int)
+        end_i, end_j = high.astype(int)
+        i, j = np.meshgrid(np.arange(first_i, end_i), np.arange(first_j, end_j), indexing="ij")
+        dx = self.origin[0] + i * self.step[0] - x
+        dy = self.origin[1] + j * self.step[1] - y
+        is_within = np.hypot(dx, dy) <= radius
+        return np.column_stack([i[is_within], j[is_within]])
 
     def is_cell_free(self, i: int, j: int, heading: int, *, reaching: bool = False) -> bool:
         """Return whether a cell is free at a heading, 0 to HEADINGS - 1; cached.
 
         `reaching` as in `is_pose_free`.
         """
-        return self._query(
-            (_FREE, int(reaching), i, j, heading),
-            lambda: (
-                self._is_roomy(i, j, reaching)
-                or self.is_pose_free(
-                    *self.center(i, j), float(self.yaws[heading]), reaching=reaching
-                )
-            ),
-        )
+
+        def check() -> bool:
+            if self._is_free_at_any_heading(i, j, reaching):
+                return True
+            x, y = self.center(i, j)
+            return self.is_pose_free(x, y, float(self.yaws[heading]), reaching=reaching)
+
+        return self._query((_FREE, int(reaching), i, j, heading), check)
 
     def is_pose_free(self, x: float, y: float, yaw: float, *, reaching: bool = False) -> bool:
         """Return whether the margins are kept at a pose x, y [m], yaw [rad] in the world.
@@ -146,10 +151,11 @@ class BaseGrid:
         self, a: ArrayLike, b: ArrayLike, yaw: float, *, reaching: bool = False
     ) -> bool:
         """Return whether the margins are kept from a to b, shape (2,) [m], at a heading [rad]."""
-        begin, end = np.asarray(a, float), np.asarray(b, float)
-        return self.base.is_drive_free(begin, end, yaw) and (
-            reaching or self.carried.is_drive_free(begin, end, yaw)
-        )
+        begin = np.asarray(a, float)
+        end = np.asarray(b, float)
+        if not self.base.is_drive_free(begin, end, yaw):
+            return False
+        return reaching or self.carried.is_drive_free(begin, end, yaw)
 
     def is_turn_free(
         self,
@@ -165,9 +171,9 @@ class BaseGrid:
         `margins`: those of the base from each obstacle, shape (S,) [m]. Default: the grid's.
         """
         place = np.asarray(at, float)
-        return self.base.is_turn_free(place, start, end, margins) and (
-            reaching or self.carried.is_turn_free(place, start, end)
-        )
+        if not self.base.is_turn_free(place, start, end, margins):
+            return False
+        return reaching or self.carried.is_turn_free(place, start, end)
 
     def compute_exit_margins(self, x: float, y: float, yaw: float) -> Floats | None:
         """Return the margins that the base can keep when it leaves a blocked pose.
@@ -175,7 +181,7 @@ class BaseGrid:
         It comes no closer to obstacles within the margin; those it overlaps are ignored.
 
         Returns:
-            Margin from each of `standing`, shape (S,) [m], -inf for ignored ones; None if the pose
+            Margin from each obstacle, shape (S,) [m], -inf for ignored ones; None if the pose
             is free.
         """
         if self.is_pose_free(x, y, yaw, reaching=True):
@@ -186,32 +192,32 @@ class BaseGrid:
         """Return whether the move ahead from a cell at a heading is free; cached."""
 
         def check() -> bool:
-            k, m = i + int(self.moves[heading, 0]), j + int(self.moves[heading, 1])
-            enough = self.lengths[heading]
-            room = [maps[i][j] + maps[k][m] for maps in self._clearance_maps]
-            return bool(room[0] >= enough and (reaching or room[1] >= enough)) or (
-                self.is_drive_free(
-                    self.center(i, j),
-                    self.center(k, m),
-                    float(self.yaws[heading]),
-                    reaching=reaching,
-                )
+            k = i + int(self.moves[heading, 0])
+            m = j + int(self.moves[heading, 1])
+            # If the clearances at both ends add up to the length, each place between is within one
+            # of them.
+            length = self.lengths[heading]
+            of_base, of_load = self._clearance_maps
+            is_base_free = of_base[i][j] + of_base[k][m] >= length
+            if is_base_free and (reaching or of_load[i][j] + of_load[k][m] >= length):
+                return True
+            return self.is_drive_free(
+                self.center(i, j), self.center(k, m), float(self.yaws[heading]), reaching=reaching
             )
 
         return self._query((_FORWARD, int(reaching), i, j, heading), check)
 
     def is_left_turn_free(self, i: int, j: int, heading: int, *, reaching: bool = False) -> bool:
         """Return whether turning in a cell from a heading to the next is free; cached."""
-        end = float(self.yaws[heading + 1]) if heading + 1 < HEADINGS else 2 * np.pi
-        return self._query(
-            (_LEFT, int(reaching), i, j, heading),
-            lambda: (
-                self._is_roomy(i, j, reaching)
-                or self.is_turn_free(
-                    self.center(i, j), float(self.yaws[heading]), end, reaching=reaching
-                )
-            ),
-        )
+
+        def check() -> bool:
+            if self._is_free_at_any_heading(i, j, reaching):
+                return True
+            begin = float(self.yaws[heading])
+            end = float(self.yaws[heading + 1]) if heading + 1 < HEADINGS else 2 * np.pi
+            return self.is_turn_free(self.center(i, j), begin, end, reaching=reaching)
+
+        return self._query((_LEFT, int(reaching), i, j, heading), check)
 
     def get_blocked_moves(self, reaching: Bools) -> tuple[Ints, Ints, Ints]:
         """Return the known blocked cells, moves ahead, and left turns, shape (K, 3) each.
@@ -219,47 +225,56 @@ class BaseGrid:
         Args:
             reaching: Where only the base counts, shape (cells, cells).
         """
-        found = []
-        for parts in self._blocked_moves:
-            rows = [np.array(part, int).reshape(-1, 3) for part in parts]
-            chosen = [row[reaching[row[:, 0], row[:, 1]] == only] for only, row in enumerate(rows)]
-            found.append(np.concatenate(chosen))
-        return found[_FREE], found[_FORWARD], found[_LEFT]
+        blocked = []
+        for with_load, base_alone in self._blocked_moves:
+            everything = np.array(with_load, int).reshape(-1, 3)
+            everything = everything[~reaching[everything[:, 0], everything[:, 1]]]
+            base = np.array(base_alone, int).reshape(-1, 3)
+            base = base[reaching[base[:, 0], base[:, 1]]]
+            blocked.append(np.concatenate([everything, base]))
+        return blocked[_FREE], blocked[_FORWARD], blocked[_LEFT]
 
     def _query(self, key: tuple[int, int, int, int, int], check: Callable[[], bool]) -> bool:
         """Return a cached answer; `key`: query, whether only the base counts, cell and heading."""
         if self._known[key] < 0:
             self._known[key] = check()
             if not self._known[key]:
-                self._blocked_moves[key[0]][key[1]].append(key[2:])
+                query, base_alone, *cell_and_heading = key
+                self._blocked_moves[query][base_alone].append(tuple(cell_and_heading))
         return bool(self._known[key])
 
-    def _is_roomy(self, i: int, j: int, reaching: bool) -> bool:
-        """Return whether a cell is free at any heading."""
-        return self._clearance_maps[0][i][j] >= 0.0 and (
-            reaching or self._clearance_maps[1][i][j] >= 0.0
-        )
+    def _is_free_at_any_heading(self, i: int, j: int, reaching: bool) -> bool:
+        """Return whether a cell is certainly free at all headings."""
+        of_base, of_load = self._clearance_maps
+        return of_base[i][j] >= 0.0 and (reaching or of_load[i][j] >= 0.0)
 
     @cached_property
     def _clearance_maps(self) -> list[list[list[float]]]:
-        """Lower bounds of the clearance of every cell at any heading, of base and load [m]."""
-        x, y = (self.origin[axis] + self.step[axis] * np.arange(self.cells) for axis in (0, 1))
-        along_x, along_y = np.outer(x, DIRECTIONS[:, 0]), np.outer(y, DIRECTIONS[:, 1])
+        """Lower bounds of the clearance of every cell at any heading, of base and load [m].
+
+        The distance of a place p from an obstacle with the support function h along the unit
+        vectors u is at least u·p − h(u). The base and its load stay within the exclusion radius.
+        """
+        x = self.origin[0] + self.step[0] * np.arange(self.cells)
+        y = self.origin[1] + self.step[1] * np.arange(self.cells)
+        along_x = np.outer(x, DIRECTIONS[:, 0])
+        along_y = np.outer(y, DIRECTIONS[:, 1])
         bodies = (self.base, self.carried)
         shape = (self.cells, self.cells)
-        rooms = (np.full(shape, _MAX_CLEARANCE), np.full(shape, _MAX_CLEARANCE))
+        clearances = (np.full(shape, _MAX_CLEARANCE), np.full(shape, _MAX_CLEARANCE))
         for s, support in enumerate(self.base.world.support):
             record_evaluations()
             reach = max(float(body.exclusion_radius[s]) for body in bodies) + _MAX_CLEARANCE
             if reach < 0.0:  # no shape can hit it
                 continue
+            # Supports along the world's axes x, y, −x and −y are eight directions apart.
             rows = slice(*np.searchsorted(x, [-support[16] - reach, support[0] + reach]))
             columns = slice(*np.searchsorted(y, [-support[24] - reach, support[8] + reach]))
             distance = (along_x[rows, None] + (along_y[columns] - support)).max(axis=2)
-            for body, room in zip(bodies, rooms, strict=True):
-                part = room[rows, columns]
+            for body, clearance in zip(bodies, clearances, strict=True):
+                part = clearance[rows, columns]
                 np.minimum(part, distance - body.exclusion_radius[s], out=part)
-        return [room.tolist() for room in rooms]
+        return [clearance.tolist() for clearance in clearances]
 
     def compute_distances(self, starts: Floats, *, threads: int = 1) -> Floats:
         """Return lower bounds of the driving distance from places, (W, 2), to every cell.
@@ -275,11 +290,13 @@ class BaseGrid:
                 cells = cells[~blocked[cells[:, 0], cells[:, 1]]]
                 if len(cells):
                     break
-            lengths = np.hypot(*(self.origin + cells * self.step - (x, y)).T)
-            entries.append((self.cells * cells[:, 0] + cells[:, 1], lengths))
-        firsts = np.cumsum([0, *(len(cells) for cells, _ in entries)])
-        begins, costs = (np.concatenate(part) for part in zip(*entries, strict=True))
-        return np.asarray(self._floor.distances(firsts, begins, costs, threads))
+            dx, dy = (self.origin + cells * self.step - (x, y)).T
+            entries.append((self.cells * cells[:, 0] + cells[:, 1], np.hypot(dx, dy)))
+        counts = [len(cells) for cells, _ in entries]
+        firsts = np.cumsum([0, *counts])
+        begins = np.concatenate([cells for cells, _ in entries])
+        lengths = np.concatenate([lengths for _, lengths in entries])
+        return np.asarray(self._floor.distances(firsts, begins, lengths, threads))
 
     @cached_property
     def _floor(self) -> Any:

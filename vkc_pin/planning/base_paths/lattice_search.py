@@ -9,6 +9,7 @@ grid are reused and make no difference.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -28,7 +29,10 @@ from vkc_pin.utils.optional_imports import import_compiled
 from vkc_pin.world.models.coordinates import wrap_angle
 
 _AHEAD, _BACK, _LEFT, _RIGHT = range(4)  # kinds of moves, as in `_driving.cpp`
-_BLOCKED, _NO_AHEAD, _NO_LEFT = 1, 2, 4  # flags of nodes
+# flags of nodes
+_BLOCKED = 1
+_NO_AHEAD = 2
+_NO_LEFT = 4
 _NONE = 2**60  # [UNIT] more than any path costs
 
 
@@ -44,55 +48,64 @@ class _EndConnections:
     def __init__(self, space: SearchSpace, extra: Floats) -> None:
         self.space = space
         self.starts = space.get_starts()
-        goals = [g for g, goal in enumerate(space.goals) if space.is_pose_free(goal)]
-        more = {goal: round(float(extra[goal]) / UNIT) for goal in goals}
-        ends = {goal: space.get_ends(goal) for goal in goals}
-        self.goal = np.repeat(np.array([*ends], int), [len(part.cell) for part in ends.values()])
-        parts = [(p.cell, p.heading, p.yaw, p.cost + more[goal]) for goal, p in ends.items()]
-        none = np.zeros(0, int)
-        columns = zip((none, none, np.zeros(0), none), *parts, strict=True)
-        self.ends = Connections(*map(np.concatenate, columns))
-        drives = [
-            (goal, how, space.get_direct_drive(goal, how)) for goal in goals for how in range(3)
-        ]
-        found = [
-            (self._compute_cost(*drive) + more[goal], goal, how)
-            for goal, how, drive in drives
-            if drive is not None
-        ]
-        self.direct = sorted(found, reverse=True)
+        goal_of_part = []
+        parts = [Connections(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0, int))]
+        direct = list[tuple[int, int, int]]()
+        for goal, pose in enumerate(space.goals):
+            if not space.is_pose_free(pose):
+                continue
+            extra_cost = round(float(extra[goal]) / UNIT)
+            ends = space.get_ends(goal)
+            goal_of_part += [goal] * len(ends.cell)
+            parts.append(replace(ends, cost=ends.cost + extra_cost))
+            for how in range(3):
+                found = space.get_direct_drive(goal, how)
+                if found is not None:
+                    drive, last_yaw = found
+                    direct.append((self._compute_cost(drive, last_yaw) + extra_cost, goal, how))
+        self.goal = np.array(goal_of_part, int)
+        self.ends = Connections(
+            np.concatenate([part.cell for part in parts]),
+            np.concatenate([part.heading for part in parts]),
+            np.concatenate([part.yaw for part in parts]),
+            np.concatenate([part.cost for part in parts]),
+        )
+        self.direct = sorted(direct, reverse=True)
         self._checked_goals: set[int] = set()  # goals whose turning range was checked
 
-    def _compute_cost(self, drive: Drive, last: float) -> int:
-        turned = abs(drive.yaw - self.space.start[2]) + abs(last - drive.yaw)
+    def _compute_cost(self, drive: Drive, last_yaw: float) -> int:
+        """Return the cost of a drive from the start with its turns [UNIT]."""
+        turned = abs(drive.yaw - self.space.start[2]) + abs(last_yaw - drive.yaw)
         return round((drive.cost * self.space.exit_cost + self.space.grid.turning * turned) / UNIT)
 
     def is_start_free(self, number: int) -> bool:
         """Return whether a connection from the start is free."""
         space = self.space
-        return space.is_sweep_free(
-            float(space.start[2]), *space.get_start_drive(self.starts, number), space.exit_margins
-        )
+        drive, yaw = space.get_start_drive(self.starts, number)
+        return space.is_sweep_free(float(space.start[2]), drive, yaw, space.exit_margins)
 
     def is_direct_free(self, goal: int, how: int) -> bool:
         """Return whether a straight drive from the start to a goal is free."""
-        direct = self.space.get_direct_drive(goal, how)
-        return direct is not None and self.space.is_sweep_free(
-            float(self.space.start[2]), *direct, self.space.exit_margins
-        )
+        space = self.space
+        direct = space.get_direct_drive(goal, how)
+        if direct is None:
+            return False
+        drive, yaw = direct
+        return space.is_sweep_free(float(space.start[2]), drive, yaw, space.exit_margins)
 
     def find_blocked(self, number: int) -> Ints:
         """Return the connections that are blocked along with one to a goal; none if it is free."""
-        space, goal = self.space, int(self.goal[number])
+        space = self.space
+        goal = int(self.goal[number])
         yaw = float(space.grid.yaws[self.ends.heading[number]])
-        if space.is_sweep_free(yaw, *space.get_goal_drive(self.ends, number, goal, yaw)):
+        drive, last_yaw = space.get_goal_drive(self.ends, number, goal, yaw)
+        if space.is_sweep_free(yaw, drive, last_yaw):
             return np.empty(0, int)
         others = np.empty(0, int)
         if goal not in self._checked_goals:
             self._checked_goals.add(goal)
-            others = np.flatnonzero(
-                (self.goal == goal) & ~space.find_turnable(space.goals[goal], self.ends)
-            )
+            can_turn = space.find_turnable(space.goals[goal], self.ends)
+            others = np.flatnonzero((self.goal == goal) & ~can_turn)
         return np.append(others, number)
 
 
@@ -121,7 +134,8 @@ def find_cheapest_path(
             cost, goal, how = ends.direct.pop()
             direct = space.get_direct_drive(goal, how)
             if direct is not None and ends.is_direct_free(goal, how):
-                return cost * UNIT, goal, [direct[0]], direct[1]
+                drive, yaw = direct
+                return cost * UNIT, goal, [drive], yaw
 
 
 class _Search:
@@ -129,32 +143,33 @@ class _Search:
 
     def __init__(self, connections: _EndConnections) -> None:
         self.connections = connections
-        self.space, self.grid = connections.space, connections.space.grid
-        grid, starts, ends = self.grid, connections.starts, connections.ends
+        self.space = connections.space
+        self.grid = connections.space.grid
         self.near = self.space.near.reshape(-1)
-        lengths = np.rint(grid.lengths / UNIT)
+        grid = self.grid
+        ahead = np.rint(grid.lengths / UNIT)
+        back = np.rint(BACKWARDS * grid.lengths / UNIT)
         left = np.rint(grid.turning * wrap_angle(np.roll(grid.yaws, -1) - grid.yaws) / UNIT)
-        costs = np.column_stack(
-            [lengths, np.rint(BACKWARDS * grid.lengths / UNIT), left, np.roll(left, 1)]
-        )
+        right = np.roll(left, 1)
+        costs = np.column_stack([ahead, back, left, right])
         self.paths = import_compiled("vkc_pin.planning.base_paths._driving").Paths(
             self._make_flags(),
             grid.moves.astype(np.int64),
             np.maximum(costs, 1.0).astype(np.int64),
-            *(
-                np.column_stack([part.cell * HEADINGS + part.heading, part.cost]).astype(np.int64)
-                for part in (starts, ends)
-            ),
+            _list_nodes_and_costs(connections.starts),
+            _list_nodes_and_costs(connections.ends),
         )
 
     def _make_flags(self) -> NDArray[np.uint8]:
         """Return the flags of known blocked nodes and moves, shape (cells, cells, HEADINGS)."""
-        near, flags = self.space.near, self.space.blocked.astype(np.uint8) * np.uint8(_BLOCKED)
-        stays, ahead, left = self.grid.get_blocked_moves(near >= 0)
+        near = self.space.near
+        flags = self.space.blocked.astype(np.uint8) * np.uint8(_BLOCKED)
+        cells, ahead, left = self.grid.get_blocked_moves(near >= 0)
         # Moves between cells near different places are checked separately, see `_is_move_free`.
-        there = ahead[:, :2] + self.grid.moves[ahead[:, 2]]
-        ahead = ahead[near[ahead[:, 0], ahead[:, 1]] == near[there[:, 0], there[:, 1]]]
-        for rows, flag in ((stays, _BLOCKED), (ahead, _NO_AHEAD), (left, _NO_LEFT)):
+        i, j, heading = ahead.T
+        k, m = (ahead[:, :2] + self.grid.moves[heading]).T
+        ahead = ahead[near[i, j] == near[k, m]]
+        for rows, flag in ((cells, _BLOCKED), (ahead, _NO_AHEAD), (left, _NO_LEFT)):
             flags[tuple(rows.T)] |= flag
         return flags
 
@@ -182,19 +197,21 @@ class _Search:
 
     def _is_move_free(self, node: int, after: int) -> bool:
         """Return whether the move between two nodes is free."""
-        grid, kind = self.grid, self._classify_move(node, after)
+        grid = self.grid
+        kind = self._classify_move(node, after)
         # Backward moves and right turns are looked up from their other end.
         first, second = (node, after) if kind in (_AHEAD, _LEFT) else (after, node)
         cell, heading = divmod(first, HEADINGS)
+        other_cell = second // HEADINGS
         i, j = divmod(cell, grid.cells)
-        near, other = self.near[cell], second // HEADINGS
+        near = self.near[cell]
         if kind in (_LEFT, _RIGHT):
             return grid.is_left_turn_free(i, j, heading, reaching=near >= 0)
-        if near == self.near[other]:
+        if near == self.near[other_cell]:
             return grid.is_move_free(i, j, heading, reaching=near >= 0)
-        return self.space.is_drive_free(
-            Drive(self.space.center(cell), self.space.center(other), float(grid.yaws[heading]))
-        )
+        a = self.space.center(cell)
+        b = self.space.center(other_cell)
+        return self.space.is_drive_free(Drive(a, b, float(grid.yaws[heading])))
 
     def _exclude_move(self, node: int, after: int) -> None:
         """Remove a blocked move, and blocked cells around it."""
@@ -228,17 +245,28 @@ class _Search:
 
     def make_drives(self, path: list[int], begin: int, end: int) -> tuple[int, list[Drive], float]:
         """Return goal, drives and yaw at the goal of a path; arguments as of `is_path_free`."""
-        space, yaws = self.space, self.grid.yaws
+        space = self.space
+        yaws = self.grid.yaws
         goal = int(self.connections.goal[end])
         drive, yaw = space.get_start_drive(self.connections.starts, begin)
-        drives, before = [drive], -1
+        drives = [drive]
+        kind_before = -1
         for node, after in pairwise(path):
             kind = self._classify_move(node, after)
             if kind in (_LEFT, _RIGHT):
                 yaw += float(wrap_angle(yaws[after % HEADINGS] - yaws[node % HEADINGS]))
             else:
-                ends = [space.center(n // HEADINGS) for n in (node, after)]
-                drives.append(Drive(drives.pop().a if kind == before else ends[0], ends[1], yaw))
-            before = kind
+                a = space.center(node // HEADINGS)
+                b = space.center(after // HEADINGS)
+                if kind == kind_before:  # the same drive goes on
+                    a = drives.pop().a
+                drives.append(Drive(a, b, yaw))
+            kind_before = kind
         drive, yaw = space.get_goal_drive(self.connections.ends, end, goal, yaw)
         return goal, [*drives, drive], yaw
+
+
+def _list_nodes_and_costs(connections: Connections) -> NDArray[np.int64]:
+    """Return node and cost [UNIT] of each connection, shape (C, 2)."""
+    nodes = connections.cell * HEADINGS + connections.heading
+    return np.column_stack([nodes, connections.cost]).astype(np.int64)

@@ -47,10 +47,13 @@ class Drive:
     @property
     def cost(self) -> float:
         """Cost without turns [m]."""
-        ahead, length = float((self.b - self.a) @ (np.cos(self.yaw), np.sin(self.yaw))), self.length
+        length = self.length
+        ahead = float((self.b - self.a) @ (np.cos(self.yaw), np.sin(self.yaw)))
         if abs(ahead) < (1.0 - _SAME) * length:
             return SIDEWAYS * length
-        return length if ahead >= 0.0 else BACKWARDS * length
+        if ahead < 0.0:
+            return BACKWARDS * length
+        return length
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,12 +90,15 @@ class SearchSpace:
     """
 
     def __init__(self, grid: BaseGrid, start: Floats, goals: Floats) -> None:
-        self.grid, self.start, self.goals = grid, start, goals
+        self.grid = grid
+        self.start = start
+        self.goals = goals
         places = np.concatenate([start[None, :2], goals[:, :2]])
         self._places = places if grid.near > 0.0 else places[:0]
         self.near = np.full((grid.cells, grid.cells), -1)
         for place, (x, y) in enumerate(self._places.tolist()):
-            self.near[tuple(grid.find_cells_within(x, y, grid.near).T)] = place
+            i, j = grid.find_cells_within(x, y, grid.near).T
+            self.near[i, j] = place
         self.blocked = grid.blocked | (grid.carried_blocked & (self.near < 0)[..., None])
         self.exit_margins = grid.compute_exit_margins(*start)
         is_clear = self.exit_margins is None or np.all(np.isfinite(self.exit_margins))
@@ -111,10 +117,12 @@ class SearchSpace:
 
     def is_drive_free(self, drive: Drive, margins: Floats | None = None) -> bool:
         """Return whether a straight drive is free."""
-        return self.grid.base.is_drive_free(drive.a, drive.b, drive.yaw, margins) and all(
-            self.grid.carried.is_drive_free(a, b, drive.yaw)
-            for a, b in self._split_outside_ends(drive)
-        )
+        if not self.grid.base.is_drive_free(drive.a, drive.b, drive.yaw, margins):
+            return False
+        for a, b in self._split_outside_ends(drive):
+            if not self.grid.carried.is_drive_free(a, b, drive.yaw):
+                return False
+        return True
 
     def is_sweep_free(
         self, before: float, drive: Drive, after: float, margins: Floats | None = None
@@ -139,20 +147,29 @@ class SearchSpace:
         return not self.blocked[cells[:, 0], cells[:, 1], heading].any()
 
     def _is_near_end(self, at: Floats) -> bool:
-        return bool(np.any(np.hypot(*(self._places - at).T) <= self.grid.near))
+        """Return whether a place is near the start or a goal."""
+        dx, dy = (self._places - at).T
+        return bool(np.any(np.hypot(dx, dy) <= self.grid.near))
 
     def _split_outside_ends(self, drive: Drive) -> Iterator[tuple[Floats, Floats]]:
-        """Yield the parts of a drive that are near neither the start nor a goal."""
-        along, from_place = drive.b - drive.a, drive.a - self._places
-        # |a + t·along − place|² = near², a quadratic in t.
-        square, mixed = float(along @ along), from_place @ along
-        rest = (from_place**2).sum(axis=1) - self.grid.near**2
+        """Yield the parts of a drive that are near neither the start nor a goal.
+
+        With d = b − a and c = a − place, the point a + t d is at the distance r = `near` from a
+        place where
+
+            |d|² t² + 2 (c·d) t + |c|² − r² = 0
+        """
+        along = drive.b - drive.a
+        from_places = drive.a - self._places
+        square = float(along @ along)
+        mixed = from_places @ along
+        constant = (from_places**2).sum(axis=1) - self.grid.near**2
         if square < _SAME**2:
-            if np.all(rest > 0.0):
+            if np.all(constant > 0.0):
                 yield drive.a, drive.b
             return
-        meets = mixed**2 > square * rest
-        root = np.sqrt(mixed[meets] ** 2 - square * rest[meets])
+        meets = mixed**2 > square * constant
+        root = np.sqrt(mixed[meets] ** 2 - square * constant[meets])
         inside = np.column_stack([-mixed[meets] - root, -mixed[meets] + root]) / square
         done = 0.0
         for begin, end in [*sorted(inside.tolist()), (1.0, np.inf)]:
@@ -163,15 +180,16 @@ class SearchSpace:
     def get_starts(self) -> Connections:
         """Return the connections from the start to the cells around it."""
         radius = _EXIT_RANGE if self.exit_cost > 1.0 else _ENTRY
-        found = self._connections(self.start, 1.0, radius, self.exit_cost)
+        connections = self._make_connections(self.start, 1.0, radius, self.exit_cost)
         # Checked first: a search from the goals would find out last.
-        return found.select(self.find_turnable(self.start, found, self.exit_margins))
+        can_turn = self.find_turnable(self.start, connections, self.exit_margins)
+        return connections.select(can_turn)
 
     def get_ends(self, goal: int) -> Connections:
         """Return the connections to a goal from the cells around it."""
-        return self._connections(self.goals[goal], -1.0, _ENTRY, 1.0)
+        return self._make_connections(self.goals[goal], -1.0, _ENTRY, 1.0)
 
-    def _connections(
+    def _make_connections(
         self, pose: Floats, sign: float, radius: float, cost_factor: float
     ) -> Connections:
         """Return connections from a pose (`sign` 1) or to it (-1)."""
@@ -180,15 +198,18 @@ class SearchSpace:
         radius = max(radius * min(1.0, step / _FULL_CELL), 1.5 * step)
         cells = grid.find_cells_within(float(pose[0]), float(pose[1]), radius)
         offset = sign * (grid.origin + cells * grid.step - pose[:2])
-        length = np.hypot(*offset.T)
-        ahead = np.where(length > _SAME, np.arctan2(offset[:, 1], offset[:, 0]), pose[2])
+        dx, dy = offset.T
+        length = np.hypot(dx, dy)
+        ahead = np.where(length > _SAME, np.arctan2(dy, dx), pose[2])
+        # Each cell three times: driven to ahead, backwards, and sideways.
         yaw = np.concatenate([ahead, ahead + np.pi, np.full(len(cells), pose[2])])
         heading = np.abs(wrap_angle(yaw[:, None] - grid.yaws)).argmin(axis=1)
         turned = np.abs(wrap_angle(yaw - pose[2])) + np.abs(wrap_angle(yaw - grid.yaws[heading]))
         driven = np.concatenate([length, BACKWARDS * length, SIDEWAYS * length])
         cost = np.rint((cost_factor * driven + grid.turning * turned) / UNIT).astype(int)
-        found = Connections(np.tile(cells @ [grid.cells, 1], 3), heading, yaw, cost)
-        return found.select(~self.blocked.reshape(-1, len(grid.yaws))[found.cell, heading])
+        cell = np.tile(grid.cells * cells[:, 0] + cells[:, 1], 3)
+        is_blocked = self.blocked.reshape(-1, len(grid.yaws))[cell, heading]
+        return Connections(cell, heading, yaw, cost).select(~is_blocked)
 
     def find_turnable(
         self, pose: Floats, connections: Connections, margins: Floats | None = None
@@ -198,7 +219,7 @@ class SearchSpace:
         The turning range is overestimated by at most a few degrees.
         """
         margins_key = None if margins is None else margins.tobytes()
-        key = pose.tobytes(), self._is_near_end(pose[:2]), margins_key
+        key = (pose.tobytes(), self._is_near_end(pose[:2]), margins_key)
         if key not in self.grid.turn_limits:  # a start or goal belongs to many searches
             self.grid.turn_limits[key] = (
                 self._measure_turn(pose, 1.0, margins) + _TURN_STEP,
@@ -212,8 +233,9 @@ class SearchSpace:
         """Return how far the base can turn left (`side` 1) or right (-1), at most π [rad]."""
         turned = 0.0
         while turned < np.pi:
-            yaws = pose[2] + side * turned, pose[2] + side * (turned + _TURN_STEP)
-            if not self.is_turn_free(pose[:2], *yaws, margins):
+            begin = pose[2] + side * turned
+            end = pose[2] + side * (turned + _TURN_STEP)
+            if not self.is_turn_free(pose[:2], begin, end, margins):
                 break
             turned += _TURN_STEP
         return turned
@@ -222,7 +244,8 @@ class SearchSpace:
         """Return the drive of a connection from the start, and the yaw in its cell [rad]."""
         yaw = float(self.start[2] + wrap_angle(connections.yaw[number] - self.start[2]))
         drive = Drive(self.start[:2], self.center(connections.cell[number]), yaw)
-        return drive, float(yaw + wrap_angle(self.grid.yaws[connections.heading[number]] - yaw))
+        yaw_in_cell = self.grid.yaws[connections.heading[number]]
+        return drive, float(yaw + wrap_angle(yaw_in_cell - yaw))
 
     def get_goal_drive(
         self, connections: Connections, number: int, goal: int, yaw: float
@@ -238,11 +261,18 @@ class SearchSpace:
         `how`: 0: ahead, 1: backwards, 2: sideways. None: too long, sideways or from a blocked
         start.
         """
-        a, b, yaw = self.start[:2], self.goals[goal, :2], float(self.start[2])
+        a = self.start[:2]
+        b = self.goals[goal, :2]
+        yaw = float(self.start[2])
         if how < 2 and np.hypot(*(b - a)) > _SAME:
-            yaw += float(wrap_angle(np.arctan2(b[1] - a[1], b[0] - a[0]) + np.pi * how - yaw))
+            direction = np.arctan2(b[1] - a[1], b[0] - a[0])
+            yaw += float(wrap_angle(direction + np.pi * how - yaw))
         drive = Drive(a, b, yaw)
-        limit = _ENTRY if how == 2 else np.inf if self.exit_margins is None else _EXIT_RANGE
+        limit = np.inf
+        if how == 2:
+            limit = _ENTRY
+        elif self.exit_margins is not None:
+            limit = _EXIT_RANGE
         if drive.length > limit:
             return None
         return drive, float(yaw + wrap_angle(self.goals[goal, 2] - yaw))

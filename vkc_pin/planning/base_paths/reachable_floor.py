@@ -64,14 +64,14 @@ class CellGrid(NamedTuple):
 
     def centers(self) -> tuple[Floats, Floats]:
         """Return x of the rows, shape (X, 1), and y of the columns, shape (1, Y) [m]."""
-        x, y = (self.origin[axis] + self.step * np.arange(self.shape[axis]) for axis in (0, 1))
+        x = self.origin[0] + self.step * np.arange(self.shape[0])
+        y = self.origin[1] + self.step * np.arange(self.shape[1])
         return x[:, None], y[None]
 
     def at(self, place: Floats) -> tuple[int, int]:
         """Return the cell nearest to a place, shape (2,) [m]."""
-        i, j = np.clip(
-            np.rint((place - self.origin) / self.step), 0, np.array(self.shape) - 1
-        ).astype(int)
+        nearest = np.rint((place - self.origin) / self.step)
+        i, j = np.clip(nearest, 0, np.array(self.shape) - 1).astype(int)
         return int(i), int(j)
 
 
@@ -97,38 +97,50 @@ class InscribedDiscs:
     def get_radius(self, height: float) -> float:
         """Return the radius of the disc around the base's origin at a height [m]; ≤ 0: none."""
         if height not in self._radii:
-            part = [
-                _compute_outline(solid, height)
-                for solid in self._solids
-                if solid.bottom < height < solid.top
-            ]
-            self._radii[height] = _find_largest_disc(part) - _SLACK
+            outlines = []
+            for solid in self._solids:
+                if solid.bottom < height < solid.top:
+                    outlines.append(_compute_outline(solid, height))
+            self._radii[height] = _find_largest_disc(outlines) - _SLACK
         return self._radii[height]
 
-    def make_walls(self, standing: Sequence[Shape]) -> list[Wall]:
+    def make_walls(self, obstacles: Sequence[Shape]) -> list[Wall]:
         """Return the walls that keep the base's origin away, whatever its heading.
 
         Args:
-            standing: Convex obstacles in the world.
+            obstacles: Convex obstacles in the world.
         """
-        levels = np.linspace(self._bottom, self._top, _HEIGHT_SAMPLES + 2)[1:-1].tolist()
-        found = []
-        for number, shape in enumerate(standing):
+        walls = []
+        for number, shape in enumerate(obstacles):
             for solid in make_solids([shape]):
-                low, high = max(solid.bottom, self._bottom), min(solid.top, self._top)
-                heights = [z for z in levels if low < z < high] or [(low + high) / 2.0] * (
-                    low < high
-                )
-                if solid.prism and heights:
-                    heights = [max(heights, key=self.get_radius)]
-                found += [
-                    Wall(self._slice(solid, z), self.get_radius(z), number)
-                    for z in heights
-                    if self.get_radius(z) > 0.0
-                ]
-        return [wall for wall in found if len(wall.outline)]
+                for height in self._list_heights(solid):
+                    radius = self.get_radius(height)
+                    if radius <= 0.0:
+                        continue
+                    outline = self._slice(solid, height)
+                    if len(outline):
+                        walls.append(Wall(outline, radius, number))
+        return walls
+
+    def _list_heights(self, solid: Solid) -> list[float]:
+        """Return heights that an obstacle shares with the base: at least one if there are any.
+
+        A prism has the same outline at all of them: the one with the largest disc will do.
+        """
+        low = max(solid.bottom, self._bottom)
+        high = min(solid.top, self._top)
+        if low >= high:
+            return []
+        levels = np.linspace(self._bottom, self._top, _HEIGHT_SAMPLES + 2)[1:-1].tolist()
+        heights = [z for z in levels if low < z < high]
+        if not heights:
+            heights = [(low + high) / 2.0]
+        if solid.prism:
+            heights = [max(heights, key=self.get_radius)]
+        return heights
 
     def _slice(self, solid: Solid, height: float) -> Floats:
+        """Return the outline of a solid at a height; cached."""
         key = (solid.key, 0.0 if solid.prism else height)
         if key not in self._outlines:
             if len(self._outlines) >= _CACHE_SIZE:
@@ -145,36 +157,34 @@ def _compute_outline(solid: Solid, height: float) -> Floats:
 
 
 def _find_largest_disc(outlines: Sequence[Floats]) -> float:
-    """Return the radius of the disc around the origin that convex polygons cover [m]; 0: none."""
-    if not any(_is_inside(outline, np.zeros((1, 2)))[0] for outline in outlines):
+    """Return the radius of the disc around the origin that convex polygons cover [m]; 0: none.
+
+    If any covers the origin, the disc ends at the nearest point of an edge that no other covers.
+    """
+    origin = np.zeros((1, 2))
+    if not any(_is_inside(outline, origin)[0] for outline in outlines):
         return 0.0
     least = np.inf
     for number, outline in enumerate(outlines):
         others = [other for k, other in enumerate(outlines) if k != number]
         for a, b in zip(outline, np.roll(outline, -1, axis=0), strict=True):
             for begin, end in _clip_uncovered(a, b, others):
-                p, q = a + begin * (b - a), a + end * (b - a)
+                p = a + begin * (b - a)
+                q = a + end * (b - a)
                 along = q - p
-                share = np.clip(-(p @ along) / max(float(along @ along), _TINY), 0.0, 1.0)
-                least = min(least, float(np.hypot(*(p + share * along))))
+                s = np.clip(-(p @ along) / max(float(along @ along), _TINY), 0.0, 1.0)
+                nearest = p + s * along
+                least = min(least, float(np.hypot(*nearest)))
     return least if np.isfinite(least) else 0.0
 
 
 def _clip_uncovered(
     a: Floats, b: Floats, others: Sequence[Floats]
 ) -> Iterator[tuple[float, float]]:
-    """Yield the parts of segment ab outside all convex polygons, as shares from 0 to 1."""
+    """Yield the parts of segment ab outside all convex polygons, as fractions from 0 to 1."""
     covered = []
     for outline in others:
-        begin, end = 0.0, 1.0
-        for p, q in zip(outline, np.roll(outline, -1, axis=0), strict=True):
-            normal = np.array([p[1] - q[1], q[0] - p[0]])  # inwards
-            first, last = float(normal @ (a - p)), float(normal @ (b - p))
-            if max(first, last) <= _TINY:
-                begin, end = 1.0, 0.0
-            elif min(first, last) < 0.0:
-                at = first / (first - last)
-                begin, end = (max(begin, at), end) if first < 0.0 else (begin, min(end, at))
+        begin, end = _clip_to_polygon(a, b, outline)
         if begin < end:
             covered.append((begin, end))
     done = 0.0
@@ -186,11 +196,36 @@ def _clip_uncovered(
         yield done, 1.0
 
 
+def _clip_to_polygon(a: Floats, b: Floats, outline: Floats) -> tuple[float, float]:
+    """Return the part of segment ab inside a convex polygon; it is empty if the end is first.
+
+    Each edge pq cuts off the fractions s at which n·(a + s (b − a) − p) < 0, with its normal n
+    inwards.
+    """
+    begin = 0.0
+    end = 1.0
+    for p, q in zip(outline, np.roll(outline, -1, axis=0), strict=True):
+        normal = np.array([p[1] - q[1], q[0] - p[0]])
+        at_a = float(normal @ (a - p))
+        at_b = float(normal @ (b - p))
+        if max(at_a, at_b) <= _TINY:
+            begin = 1.0
+            end = 0.0
+        elif min(at_a, at_b) < 0.0:
+            passes = at_a / (at_a - at_b)
+            if at_a < 0.0:
+                begin = max(begin, passes)
+            else:
+                end = min(end, passes)
+    return begin, end
+
+
 def _is_inside(outline: Floats, places: Floats) -> Bools:
     """Return which places, shape (B, 2), are inside a convex polygon, shape (B,)."""
     edge = np.roll(outline, -1, axis=0) - outline
     offset = places[:, None] - outline
-    return np.asarray((edge[:, 0] * offset[..., 1] - edge[:, 1] * offset[..., 0] > 0.0).all(axis=1))
+    cross = edge[:, 0] * offset[..., 1] - edge[:, 1] * offset[..., 0]  # positive left of an edge
+    return np.asarray((cross > 0.0).all(axis=1))
 
 
 def find_blocked_cells(
@@ -201,14 +236,17 @@ def find_blocked_cells(
     The centre of a blocked cell is within the wall's radius plus `grown` [m]. Minus half a cell's
     diagonal: blocked cells are blocked entirely. Plus: other cells are free entirely.
     """
-    outline, reach = wall.outline, wall.radius + grown
+    outline = wall.outline
+    reach = wall.radius + grown
     low = np.ceil((outline.min(axis=0) - max(reach, 0.0) - cells.origin) / cells.step)
     high = np.floor((outline.max(axis=0) + max(reach, 0.0) - cells.origin) / cells.step) + 1
-    rows, columns = (
-        slice(*np.clip([low[k], high[k]], 0, cells.shape[k]).astype(int).tolist()) for k in (0, 1)
-    )
+    first_row, first_column = np.clip(low, 0, cells.shape).astype(int).tolist()
+    end_row, end_column = np.clip(high, 0, cells.shape).astype(int).tolist()
+    rows = slice(first_row, end_row)
+    columns = slice(first_column, end_column)
     x, y = cells.centers()
-    return (rows, columns), _compute_signed_distance(outline, x[rows], y[:, columns]) < reach
+    distance = _compute_signed_distance(outline, x[rows], y[:, columns])
+    return (rows, columns), distance < reach
 
 
 def find_free_floor(scene: Scene) -> tuple[CellGrid, Bools]:
@@ -218,32 +256,38 @@ def find_free_floor(scene: Scene) -> tuple[CellGrid, Bools]:
     """
     arena = scene.arena
     base = [shape for shape in scene.robot.collision.geometryObjects if shape.parentJoint == _BASE]
-    standing = [
-        shape
-        for shape, label in zip(scene.obstacles, scene.obstacle_labels, strict=True)
-        if label != FLOOR
-    ]
+    obstacles = []
+    for shape, label in zip(scene.obstacles, scene.obstacle_labels, strict=True):
+        if label != FLOOR:
+            obstacles.append(shape)
     for placed in scene.objects.values():
-        standing += make_world_shapes(placed)
+        obstacles += make_world_shapes(placed)
     cells = CellGrid.over(np.array([arena[0], arena[2]]), np.array([arena[1], arena[3]]), CELL)
     free = np.ones(cells.shape, bool)
-    for wall in InscribedDiscs(list_placed_shapes(base)).make_walls(list_placed_shapes(standing)):
-        window, own = find_blocked_cells(cells, wall, 0.0)
-        free[window] &= ~own
+    discs = InscribedDiscs(list_placed_shapes(base))
+    for wall in discs.make_walls(list_placed_shapes(obstacles)):
+        window, is_blocked = find_blocked_cells(cells, wall, 0.0)
+        free[window] &= ~is_blocked
     return cells, free
 
 
 def _compute_signed_distance(outline: Floats, x: Floats, y: Floats) -> Floats:
-    """Return signed distances from a convex polygon, negative inside."""
-    square = np.full((len(x), y.shape[1]), np.inf)
-    inside = np.full((len(x), y.shape[1]), len(outline) > 2)
+    """Return signed distances of places from a convex polygon, negative inside, shape (X, Y).
+
+    An edge e from a has the point a + s e nearest to a place a + o, with s = o·e / e·e from 0 to 1.
+    """
+    squared = np.full((len(x), y.shape[1]), np.inf)
+    is_inside = np.full((len(x), y.shape[1]), len(outline) > 2)
     for (ax, ay), (bx, by) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
-        ex, ey, ox, oy = bx - ax, by - ay, x - ax, y - ay
-        share = np.clip((ox * ex + oy * ey) / max(ex * ex + ey * ey, _TINY), 0.0, 1.0)
-        np.minimum(square, (ox - share * ex) ** 2 + (oy - share * ey) ** 2, out=square)
-        inside &= ex * oy - ey * ox > 0.0
-    distance = np.sqrt(square)
-    return np.where(inside, -distance, distance)
+        ex = bx - ax
+        ey = by - ay
+        ox = x - ax
+        oy = y - ay
+        s = np.clip((ox * ex + oy * ey) / max(ex * ex + ey * ey, _TINY), 0.0, 1.0)
+        np.minimum(squared, (ox - s * ex) ** 2 + (oy - s * ey) ** 2, out=squared)
+        is_inside &= ex * oy - ey * ox > 0.0
+    distance = np.sqrt(squared)
+    return np.where(is_inside, -distance, distance)
 
 
 def flood_fill(free: Bools, begin: Bools, *, corners: bool) -> Bools:
@@ -253,8 +297,12 @@ def flood_fill(free: Bools, begin: Bools, *, corners: bool) -> Bools:
     """
     from scipy import ndimage
 
-    around = np.ones((3, 3), bool) if corners else ndimage.generate_binary_structure(2, 1)
-    labels, _ = ndimage.label(free, structure=around)
-    near = ndimage.binary_dilation(begin, structure=around) if corners else begin
-    known = np.unique(labels[near & free])
-    return np.asarray(begin | (np.isin(labels, known[known > 0])))
+    if corners:
+        neighbours = np.ones((3, 3), bool)
+        near_begin = ndimage.binary_dilation(begin, structure=neighbours)
+    else:
+        neighbours = ndimage.generate_binary_structure(2, 1)
+        near_begin = begin
+    labels, _ = ndimage.label(free, structure=neighbours)
+    reached = np.unique(labels[near_begin & free])
+    return np.asarray(begin | np.isin(labels, reached[reached > 0]))

@@ -37,17 +37,14 @@ def find_shortest_path_pieces(goal: Floats, radius: float) -> list[tuple[float, 
     Raises:
         BuildError: The compiled module is missing.
     """
-    return [
-        (radius * length, turn)
-        for length, turn in _compute_words(goal[None])[0].tolist()
-        if abs(length) > _SAME
-    ]
+    pieces = []
+    for length, turn in _compute_words(goal[None])[0].tolist():
+        if abs(length) > _SAME:
+            pieces.append((radius * length, turn))
+    return pieces
 
 
 def _compute_words(goals: Floats) -> Floats:
     """Return lengths in radii and turns of the pieces of paths, (B, 5, 2); 0 if unused."""
-    return np.asarray(
-        import_compiled("vkc_pin.planning.base_paths._driving").shortest_words(
-            np.ascontiguousarray(goals, float)
-        )
-    )
+    driving = import_compiled("vkc_pin.planning.base_paths._driving")
+    return np.asarray(driving.shortest_words(np.ascontiguousarray(goals, float)))

@@ -52,35 +52,8 @@ def find_impossible_conditions(problem: TrajectoryProblem) -> list[Violation]:
 
     They name waypoints, but no times, which depend on the motion in the plan.
     """
-    start = problem.start[None]
-    contacts = problem.contacts.evaluate(start, np.array([0]), reach=0.0)
-    labels, deepest = problem.contacts.phases[0].labels, dict[str, float]()
-    for (first, second), distance, margin in zip(
-        contacts.pair, contacts.distance, contacts.margin, strict=True
-    ):
-        # Margins may be negative where the scene allows contact.
-        if distance < (margin if margin > CONTACT_DEPTH else margin - CONTACT_DEPTH):
-            subject = f"{labels[first]} – {labels[second]}"
-            deepest[subject] = min(float(distance), deepest.get(subject, np.inf))
-    found = []
-    for subject, distance in deepest.items():  # links of several shapes count once
-        depth = f"{-1e3 * distance:.1f}"
-        detail = "touch at the start" if depth == "0.0" else f"overlap by {depth} mm at the start"
-        found.append(Violation("start", subject, amount=-distance, unit="m", detail=detail))
-    for goal, solver in zip(problem.pose_goals, problem.transcription.pose_solvers, strict=True):
-        if goal.kind == "closure" and goal.object in problem.scene.held and 1 in goal.row.waypoints:
-            error = float(np.abs(solver.evaluate(start, goal.target)[0]).max())
-            if error > Tolerances().closure_position:
-                detail = (
-                    f"it is grasped at the start, but the hand is {error:.4f} m or rad "
-                    "from its attachment"
-                )
-                with contextlib.suppress(InputError):
-                    problem.scene.with_measured_grasp(goal.object)
-                    detail += "; if it is there, see Scene.with_measured_grasp"
-                found.append(
-                    Violation("closure", goal.about, amount=error, unit="m", detail=detail)
-                )
+    found = _find_collisions_at_start(problem)
+    found += _find_open_closures_at_start(problem)
     for phase, end in zip(problem.task.phases, problem.ends.tolist(), strict=True):
         for name, (least, most) in problem.coordinate_goals(phase).items():
             lower, upper = problem.limits(name)
@@ -100,9 +73,52 @@ def find_impossible_conditions(problem: TrajectoryProblem) -> list[Violation]:
     return found
 
 
+def _find_collisions_at_start(problem: TrajectoryProblem) -> list[Violation]:
+    """Find the pairs of links that overlap at the start by more than the scene allows."""
+    contacts = problem.contacts.evaluate(problem.start[None], np.array([0]), reach=0.0)
+    labels = problem.contacts.phases[0].labels
+    deepest = dict[str, float]()  # links of several shapes count once
+    for (first, second), distance, margin in zip(
+        contacts.pair, contacts.distance, contacts.margin, strict=True
+    ):
+        # Margins may be negative where the scene allows contact.
+        least = margin if margin > CONTACT_DEPTH else margin - CONTACT_DEPTH
+        if distance < least:
+            subject = f"{labels[first]} – {labels[second]}"
+            deepest[subject] = min(float(distance), deepest.get(subject, np.inf))
+    violations = []
+    for subject, distance in deepest.items():
+        depth = f"{-1e3 * distance:.1f}"
+        detail = "touch at the start" if depth == "0.0" else f"overlap by {depth} mm at the start"
+        violations.append(Violation("start", subject, amount=-distance, unit="m", detail=detail))
+    return violations
+
+
+def _find_open_closures_at_start(problem: TrajectoryProblem) -> list[Violation]:
+    """Find the grasps of the start that the hand does not have there."""
+    violations = []
+    for goal, solver in zip(problem.pose_goals, problem.transcription.pose_solvers, strict=True):
+        is_closure_of_start = goal.kind == "closure" and 1 in goal.row.waypoints
+        if not is_closure_of_start or goal.object not in problem.scene.held:
+            continue
+        residual, _ = solver.evaluate(problem.start[None], goal.target)
+        error = float(np.abs(residual).max())
+        if error <= Tolerances().closure_position:
+            continue
+        detail = (
+            f"it is grasped at the start, but the hand is {error:.4f} m or rad from its attachment"
+        )
+        with contextlib.suppress(InputError):
+            problem.scene.with_measured_grasp(goal.object)
+            detail += "; if it is there, see Scene.with_measured_grasp"
+        violations.append(Violation("closure", goal.about, amount=error, unit="m", detail=detail))
+    return violations
+
+
 def _find_collisions_at_goal(problem: TrajectoryProblem, end: int) -> list[Violation]:
     """Find the pairs that are too close at a waypoint whatever the coordinates left free are."""
-    lower, upper = problem.lower[end - 1], problem.upper[end - 1]
+    lower = problem.lower[end - 1]
+    upper = problem.upper[end - 1]
     z = np.clip(problem.start, lower, upper)
     reach = problem.options.largest_margin
     contacts = problem.contacts.evaluate(z[None], np.array([end]), reach=reach)
@@ -132,14 +148,18 @@ def _find_collisions_at_goal(problem: TrajectoryProblem, end: int) -> list[Viola
 
 def diagnose_goals(problem: TrajectoryProblem, random_seed: int) -> list[BlockedGoal]:
     """Explain all goals of an unsolved problem without a known collision-free configuration."""
-    numbers = range(len(problem.task.phases))
-    found = (diagnose_goal(problem, number, random_seed) for number in numbers)
-    return [goal for goal in found if goal is not None]
+    blocked = []
+    for number in range(len(problem.task.phases)):
+        goal = diagnose_goal(problem, number, random_seed)
+        if goal is not None:
+            blocked.append(goal)
+    return blocked
 
 
 def diagnose_goal(problem: TrajectoryProblem, number: int, random_seed: int) -> BlockedGoal | None:
     """Explain the goal of one phase; None if it has a collision-free configuration."""
-    phase, end = problem.task.phases[number], int(problem.ends[number])
+    phase = problem.task.phases[number]
+    end = int(problem.ends[number])
     samples = _sample_goal(problem, end, np.random.default_rng(random_seed))
     if samples is None:
         return None
@@ -161,12 +181,12 @@ def diagnose_goal(problem: TrajectoryProblem, number: int, random_seed: int) -> 
     best = int(np.argmin(shortfall))
     worst = int(np.flatnonzero(contacts.waypoint == best)[0])
     labels = problem.contacts.phases[problem.contacts.find_phase(end)].labels
-    first, second = (labels[shape] for shape in contacts.pair[worst])
+    first, second = contacts.pair[worst]
     distance = 1e3 * contacts.distance[worst]
     gap = f"overlap by {-distance:.1f} mm" if distance < 0 else f"are only {distance:.1f} mm apart"
     text = (
         f"{phase.name}: all {len(reached)} configurations found there are blocked; "
-        f"in the least blocked one {first} – {second} {gap}"
+        f"in the least blocked one {labels[first]} – {labels[second]} {gap}"
     )
     return BlockedGoal(text, float(shortfall[best]), number)
 
@@ -180,36 +200,44 @@ def describe_free_range(problem: TrajectoryProblem, number: int, random_seed: in
         Joint positions, for example "hinge = 1.18 rad"; empty if the phase moves no joint to a
         goal of the task, or if nothing free is found.
     """
-    phase, row = problem.task.phases[number], int(problem.ends[number]) - 1
-    wanted = [
-        f"{step.object}.{joint}"
-        for step in problem.task.steps
-        if isinstance(step, Actuate)
-        for joint in step.joints
-    ]
-    names = [name for name in phase.values if name in wanted]
+    phase = problem.task.phases[number]
+    row = int(problem.ends[number]) - 1
+    goals_of_task = set[str]()
+    for step in problem.task.steps:
+        if isinstance(step, Actuate):
+            goals_of_task.update(f"{step.object}.{joint}" for joint in step.joints)
+    names = [name for name in phase.values if name in goals_of_task]
     begin = np.array([phase.initial_values[name] for name in names])
     columns = [problem.chain.index(name) for name in names]
     end = problem.lower[row, columns]
     if (begin == end).all():
         return ""
-    free, least, most = None, 0.0, 1.0
+    free = None
+    # fractions of the displacement: the largest free one, and the smallest without a free sample
+    least = 0.0
+    most = 1.0
     for _ in range(_BISECTIONS):
-        share = (least + most) / 2
-        values = np.round(begin + share * (end - begin), 3)  # so that the text is exact
-        lower, upper = problem.lower.copy(), problem.upper.copy()
-        lower[row, columns] = upper[row, columns] = values
-        other, rng = problem.with_bounds(lower, upper), np.random.default_rng(random_seed)
-        if _has_free_sample(other, row + 1, sample_goal_configurations(other, row + 1, rng)):
-            free, least = values, share
+        s = (least + most) / 2
+        values = np.round(begin + s * (end - begin), 3)  # so that the text is exact
+        lower = problem.lower.copy()
+        upper = problem.upper.copy()
+        lower[row, columns] = values
+        upper[row, columns] = values
+        other = problem.with_bounds(lower, upper)
+        rng = np.random.default_rng(random_seed)
+        samples = sample_goal_configurations(other, row + 1, rng)
+        if _has_free_sample(other, row + 1, samples):
+            free = values
+            least = s
         else:
-            most = share
+            most = s
     if free is None:
         return ""
-    return ", ".join(
-        f"{name.partition('.')[2]} = {value:g} {problem.unit(name)}"
-        for name, value in zip(names, free.tolist(), strict=True)
-    )
+    parts = []
+    for name, value in zip(names, free.tolist(), strict=True):
+        _, _, joint = name.partition(".")
+        parts.append(f"{joint} = {value:g} {problem.unit(name)}")
+    return ", ".join(parts)
 
 
 def _has_free_sample(
@@ -234,5 +262,6 @@ def _sample_goal(
         batches.append(samples)
         if _has_free_sample(problem, waypoint, samples):
             break
-    z, residual = (np.concatenate(parts) for parts in zip(*batches, strict=True))
+    z = np.concatenate([configurations for configurations, _ in batches])
+    residual = np.concatenate([residuals for _, residuals in batches])
     return z, residual

@@ -14,6 +14,7 @@ from vkc_pin.planning.initialization.keyframes import (
     sample_goal_configurations,
 )
 from vkc_pin.planning.nlp.merit import TOLERANCE
+from vkc_pin.planning.nlp.pose_goals import find_phase_spans
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Report
@@ -51,46 +52,57 @@ def diagnose_paths(
     """
     if problem.chain.robot.base == "fixed":
         return PathDiagnosis(list(blocked))
-    lines, routes, path, is_cut_off = [], BaseRoutes(problem), problem.waypoints(z), False
-    begin, last = 0, path[0, :3]
-    for number, (phase, end) in enumerate(
-        zip(problem.task.phases, problem.ends.tolist(), strict=True)
-    ):
-        lower, upper = problem.lower[end - 1, :3], problem.upper[end - 1, :3]
-        start, last = last, np.clip(path[end, :3], lower, upper)
-        own = [line for line in blocked if line.startswith(f"{phase.name}: ")]
-        is_hit = any(
-            v.constraint in ("penetration", "clearance") and begin <= v.waypoint <= end
-            for v in report.violations
-        )
-        begin = end
-        if problem.is_closed(phase) or not (own or is_hit):
-            lines += own
+    lines = []
+    is_cut_off = False
+    routes = BaseRoutes(problem)
+    path = problem.waypoints(z)
+    last = path[0, :3]
+    for number, (phase, begin, end) in enumerate(find_phase_spans(problem.task)):
+        lower = problem.lower[end - 1, :3]
+        upper = problem.upper[end - 1, :3]
+        start = last
+        last = np.clip(path[end, :3], lower, upper)
+        own_lines = [line for line in blocked if line.startswith(f"{phase.name}: ")]
+        has_collision = _has_collision(report, begin, end)
+        if problem.is_closed(phase) or not (own_lines or has_collision):
+            lines += own_lines
             continue
-        goals, where = _find_base_goals(problem, number, last, random_seed)
-        home, folded = (
-            shortest_path(routes.get_grid(number, folded=how), start.tolist(), goals, smooth=False)
-            for how in (False, True)
+        goals, description = _find_base_goals(problem, number, last, random_seed)
+        with_arm_at_home = shortest_path(
+            routes.get_grid(number, folded=False), start.tolist(), goals, smooth=False
         )
-        found = home or folded
-        ends = f"from {_format_place(start)} to "
-        ends += where if found is None else _format_place(found.poses[-1])
+        with_arm_folded = shortest_path(
+            routes.get_grid(number, folded=True), start.tolist(), goals, smooth=False
+        )
+        found = with_arm_at_home or with_arm_folded
+        if found is not None:
+            description = _format_place(found.poses[-1])
+        ends = f"from {_format_place(start)} to {description}"
         if found is None:
             text = f"found no path for the base {ends}, and none with the arm folded"
             is_cut_off = is_cut_off or number == 0
-        elif home is None:
+        elif with_arm_at_home is None:
             text = (
                 f"found no path for the base {ends} but with the arm folded, "
                 "and none for the arm to there"
             )
-        elif is_hit:
+        elif has_collision:
             text = f"found a path for the base {ends}, but none for the arm at the goal"
         else:
-            lines += own
+            lines += own_lines
             continue
         lines.append(f"{phase.name}: {text}")
     # Phases with the same name have the same explanations.
     return PathDiagnosis(list(dict.fromkeys(lines)), is_cut_off)
+
+
+def _has_collision(report: Report, begin: int, end: int) -> bool:
+    """Return whether a report has a collision from waypoint `begin` to `end`."""
+    for violation in report.violations:
+        is_collision = violation.constraint in ("penetration", "clearance")
+        if is_collision and begin <= violation.waypoint <= end:
+            return True
+    return False
 
 
 def _find_base_goals(
@@ -105,8 +117,9 @@ def _find_base_goals(
         rng = np.random.default_rng(random_seed)
         samples = sample_goal_configurations(problem, end, rng)
         if samples is not None:
-            z = samples[0][samples[1] < TOLERANCE]
-            free = z[find_free_configurations(problem, z, end)]
+            z, residual = samples
+            reached = z[residual < TOLERANCE]
+            free = reached[find_free_configurations(problem, reached, end)]
             if len(free):
                 return free[:, :3], f"any of {len(free)} places from which the goal was reached"
     goals = np.tile(last, (_HEADINGS, 1))

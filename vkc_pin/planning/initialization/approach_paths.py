@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence, Sized
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -33,10 +32,15 @@ class ApproachPaths:
     """
 
     def __init__(self, sampler: KeyframeSampler, *, keeps_base_fixed: bool = False) -> None:
-        self.sampler, self.problem, self.chain = sampler, sampler.problem, sampler.chain
+        self.sampler = sampler
+        self.problem = sampler.problem
+        self.chain = sampler.chain
         self.keeps_base_fixed = keeps_base_fixed or sampler.curves is not None
-        self.joint, self.local = joint, local = self.chain.frame(self.chain.robot.tool_frame)
-        model, cache = self.chain.model, self.problem.cache
+        joint, local = self.chain.frame(self.chain.robot.tool_frame)
+        self.joint = joint
+        self.local = local
+        model = self.chain.model
+        cache = self.problem.cache
         key = ("tool", model.saveToString(), joint, local.homogeneous.tobytes())
         self.solver = cache.get(key, lambda: PoseSolver(model, PoseRow(joint, local, ()), cache))
 
@@ -70,7 +74,9 @@ class ApproachPaths:
         """
         if phase.released:
             return self._move_back(z, self.chain.holder(phase.released[0]), drives=False)
-        return self._move_tool(z, _UP, drives=False) if phase.held else np.empty((0, len(z)))
+        if phase.held:
+            return self._move_tool(z, _UP, drives=False)
+        return np.empty((0, len(z)))
 
     def _move_back(self, z: Floats, frame: tuple[int, pin.SE3], *, drives: bool = True) -> Floats:
         """Move the tool against the approach direction, the z axis of a frame."""
@@ -85,17 +91,26 @@ class ApproachPaths:
         tool = pin.SE3(rotations[0, self.joint], translations[0, self.joint]) * self.local
         offset = self.problem.options.approach * direction
         target = pin.SE3(tool.rotation, tool.translation + offset)
-        lower, upper = z.copy(), z.copy()  # only the robot moves
+        # Only the robot moves.
+        lower = z.copy()
+        upper = z.copy()
         for column, name in enumerate(self.chain.names[: self.sampler.robot_size]):
             if drives or column > 2:
                 lower[column], upper[column] = self.problem.limits(name)
         limits = [(lower, upper)]
         if self.keeps_base_fixed:
-            fixed = np.concatenate([z[:3], lower[3:]]), np.concatenate([z[:3], upper[3:]])
-            limits.insert(0, fixed)
-        how: dict[str, Any] = {"weights": self.sampler.weights, "tolerance": TOLERANCE}
+            lower_with_base = np.concatenate([z[:3], lower[3:]])
+            upper_with_base = np.concatenate([z[:3], upper[3:]])
+            limits.insert(0, (lower_with_base, upper_with_base))
         for low, high in limits:
-            near, is_reached = self.solver.solve(z[None], target, lower=low, upper=high, **how)
+            moved, is_reached = self.solver.solve(
+                z[None],
+                target,
+                lower=low,
+                upper=high,
+                weights=self.sampler.weights,
+                tolerance=TOLERANCE,
+            )
             if is_reached[0]:
-                return near
+                return moved
         return np.empty((0, len(z)))

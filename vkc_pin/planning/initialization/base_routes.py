@@ -34,7 +34,8 @@ class BaseRoutes:
     """
 
     def __init__(self, problem: TrajectoryProblem) -> None:
-        self.problem, self.chain = problem, problem.chain
+        self.problem = problem
+        self.chain = problem.chain
         self.arm = slice(3, self.chain.robot.coordinates.size)
         self._grids: dict[tuple[int, bool], BaseGrid] = {}
         self._folded: dict[tuple[Hold, ...], Floats] = {}
@@ -52,38 +53,57 @@ class BaseRoutes:
         """
         key = (phase, folded)
         if key not in self._grids:
-            z, arena = self._make_resting_configuration(), self.problem.scene.arena
-            how: dict[str, Any] = {"margin": self.problem.options.dist_safe}
-            if folded:
-                z[self.arm] = self.get_folded_arm(phase)
-                how = {"margin": 0.0, "cells": compute_fine_cell_count(arena, how["margin"])}
-            how |= {"near": _REACHING_RADIUS, "cache": self.problem.cache}
-            moving, fixed = collect_grid_shapes(self.problem, phase, z)
-            # The arm's first link counts with the base: a low base must not drive under a table
-            # that the arm would hit.
-            base = [shape for joint, shape in moving if joint <= _ARM_BASE]
-            carried = [shape for joint, shape in moving if joint > _ARM_BASE]
-            self._grids[key] = BaseGrid(
-                base, carried, fixed, arena, turning=self.chain.robot.lever, **how
-            )
+            self._grids[key] = self._make_grid(phase, folded)
         return self._grids[key]
+
+    def _make_grid(self, phase: int, folded: bool) -> BaseGrid:
+        """Return a new grid; see `get_grid`."""
+        z = self._make_resting_configuration()
+        arena = self.problem.scene.arena
+        dist_safe = self.problem.options.dist_safe
+        settings: dict[str, Any] = {"margin": dist_safe}
+        if folded:
+            z[self.arm] = self.get_folded_arm(phase)
+            settings = {"margin": 0.0, "cells": compute_fine_cell_count(arena, dist_safe)}
+        moving, fixed = collect_grid_shapes(self.problem, phase, z)
+        # The arm's first link counts with the base: a low base must not drive under a table that
+        # the arm would hit.
+        base = [shape for joint, shape in moving if joint <= _ARM_BASE]
+        carried = [shape for joint, shape in moving if joint > _ARM_BASE]
+        return BaseGrid(
+            base,
+            carried,
+            fixed,
+            arena,
+            near=_REACHING_RADIUS,
+            turning=self.chain.robot.lever,
+            cache=self.problem.cache,
+            **settings,
+        )
 
     def get_folded_arm(self, phase: int) -> Floats:
         """Return the most compact posture in a phase, (m - 3,); see `find_folded_arms`."""
         return np.asarray(self._get_folded_arms(phase)[0])
 
     def find_nearest_folded_arm(self, phase: int, first: Floats, last: Floats) -> Floats:
-        """Return the folded arm nearest to the motion between two postures, all (m - 3,)."""
-        chain, arms = self.chain, self._get_folded_arms(phase)
-        turns = [self.problem.unit(name) == "rad" for name in chain.names[self.arm]]
-        wound = arms + 2.0 * np.pi * np.array([0.0, -1.0, 1.0])[:, None, None] * turns
-        lengths = (np.abs(wound - first) + np.abs(wound - last)) * chain.metric[self.arm]
-        is_outside = (wound < chain.lower[self.arm]) | (wound > chain.upper[self.arm])
+        """Return the folded arm nearest to the motion between two postures, all (m - 3,).
+
+        Each of its angles may be a full turn more or less, within limits.
+        """
+        chain = self.chain
+        arms = self._get_folded_arms(phase)
+        is_angle = [self.problem.unit(name) == "rad" for name in chain.names[self.arm]]
+        full_turns = 2.0 * np.pi * np.array([0.0, -1.0, 1.0])[:, None, None] * is_angle
+        variants = arms + full_turns  # (3, F, m - 3)
+        lengths = (np.abs(variants - first) + np.abs(variants - last)) * chain.metric[self.arm]
+        is_outside = (variants < chain.lower[self.arm]) | (variants > chain.upper[self.arm])
         lengths[1:][is_outside[1:]] = np.inf
         nearest = int(np.argmin(lengths.min(axis=0).sum(axis=1)))
-        return np.asarray(wound[lengths[:, nearest].argmin(axis=0), nearest, np.arange(len(first))])
+        best_turns = lengths[:, nearest].argmin(axis=0)
+        return np.asarray(variants[best_turns, nearest, np.arange(len(first))])
 
     def _get_folded_arms(self, phase: int) -> Floats:
+        """Return all folded postures in a phase, (F, m - 3); see `find_folded_arms`."""
         held = self.problem.task.phases[phase].held
         if held not in self._folded:
             resting = self._make_resting_configuration()
@@ -92,10 +112,14 @@ class BaseRoutes:
 
     def _make_resting_configuration(self) -> Floats:
         """Return the arm at home on a base at the origin, grasp coordinates near 0, shape (n,)."""
-        chain, z = self.chain, self.problem.start.copy()
-        z[:3], z[self.arm] = 0.0, chain.robot.home
-        for column in (chain.index(name) for names in chain.virtual.values() for name in names):
-            z[column] = np.clip(0.0, chain.lower[column], chain.upper[column])
+        chain = self.chain
+        z = self.problem.start.copy()
+        z[:3] = 0.0
+        z[self.arm] = chain.robot.home
+        for names in chain.virtual.values():
+            for name in names:
+                column = chain.index(name)
+                z[column] = np.clip(0.0, chain.lower[column], chain.upper[column])
         return z
 
     def compute_distances(
@@ -106,16 +130,23 @@ class BaseRoutes:
         Infinite: there is no path. Starts within `SIMILARITY_TOLERANCE` share the distances of the
         first one.
         """
-        grid, known = self.get_grid(phase, folded=folded), self._distances
-        end = np.floor((goals[:, :2] - grid.origin) / grid.step + 0.5).astype(int)
-        end = np.clip(end, 0, grid.cells - 1)
-        begin = np.floor(starts[:, :2] / SIMILARITY_TOLERANCE).astype(int).tolist()
-        keys = [(phase, folded, *cell) for cell in begin]
-        new = {key: start[:2] for key, start in zip(keys, starts, strict=True) if key not in known}
-        if new:
-            found = grid.compute_distances(np.array(list(new.values())), threads=count_threads())
-            known |= dict(zip(new, found, strict=True))
-        return np.array([known[key][i, j] for key, (i, j) in zip(keys, end.tolist(), strict=True)])
+        grid = self.get_grid(phase, folded=folded)
+        goal_cells = np.floor((goals[:, :2] - grid.origin) / grid.step + 0.5).astype(int)
+        goal_cells = np.clip(goal_cells, 0, grid.cells - 1)
+        start_cells = np.floor(starts[:, :2] / SIMILARITY_TOLERANCE).astype(int).tolist()
+        keys = [(phase, folded, i, j) for i, j in start_cells]
+        new_starts = {}
+        for key, start in zip(keys, starts, strict=True):
+            if key not in self._distances:
+                new_starts[key] = start[:2]
+        if new_starts:
+            places = np.array(list(new_starts.values()))
+            maps = grid.compute_distances(places, threads=count_threads())
+            self._distances.update(zip(new_starts, maps, strict=True))
+        distances = []
+        for key, (i, j) in zip(keys, goal_cells.tolist(), strict=True):
+            distances.append(self._distances[key][i, j])
+        return np.array(distances)
 
     def find_path(self, phase: int, start: Floats, goal: Floats, steps: int) -> Floats | None:
         """Find `steps` base poses from start to goal, both (3,), without the start: (steps, 3).
@@ -135,20 +166,25 @@ class BaseRoutes:
     def _find_path(
         self, phase: int, start: Floats, goal: Floats, steps: int, *, folded: bool
     ) -> Floats | None:
-        grid, rolling = self.get_grid(phase, folded=folded), self.problem.rolling
+        """Find a path with the arm at home or folded; see `find_path`."""
+        grid = self.get_grid(phase, folded=folded)
+        rolling = self.problem.rolling
+        turning = self.chain.robot.lever
         key = (phase, folded, start.tobytes(), goal.tobytes())
         if key not in self._paths:
             self._paths[key] = shortest_path(grid, start.tolist(), goal[None])
-        path, turning = self._paths[key], self.chain.robot.lever
+        path = self._paths[key]
         if path is None:
             return None
         if rolling.is_omnidirectional:
             return sample_poses(path, steps, turning=turning)
         corners = path.poses  # a base on wheels gets a pose at each corner, so that it rolls
         if rolling.turning_radius > 0.0:
-            corners = Curves(rolling.turning_radius, turning).fit(
-                corners, lambda pose: grid.is_pose_free(*pose, reaching=True)
-            )
+
+            def is_free(pose: Floats) -> bool:
+                return grid.is_pose_free(*pose, reaching=True)
+
+            corners = Curves(rolling.turning_radius, turning).fit(corners, is_free)
         return sample_path(corners, steps, turning=turning)
 
 
@@ -168,13 +204,16 @@ def find_folded_arms(problem: TrajectoryProblem, phase: int, resting: Floats) ->
     Returns:
         Postures, shape (F, m - 3) [m] or [rad].
     """
-    chain, rng = problem.chain, np.random.default_rng(0)
-    arm, home = slice(3, chain.robot.coordinates.size), chain.robot.home
-    turns = np.array([problem.unit(name) == "rad" for name in chain.names[arm]])
-    lower = np.where(turns, np.maximum(chain.lower[arm], home - np.pi), chain.lower[arm])
-    upper = np.where(turns, np.minimum(chain.upper[arm], home + np.pi), chain.upper[arm])
+    chain = problem.chain
+    arm = slice(3, chain.robot.coordinates.size)
+    home = chain.robot.home
+    is_angle = np.array([problem.unit(name) == "rad" for name in chain.names[arm]])
+    lower = np.where(is_angle, np.maximum(chain.lower[arm], home - np.pi), chain.lower[arm])
+    upper = np.where(is_angle, np.minimum(chain.upper[arm], home + np.pi), chain.upper[arm])
+    rng = np.random.default_rng(0)
     z = np.tile(resting, (_POSTURE_SAMPLES, 1))
-    z[:, arm] = [home, *rng.uniform(lower, upper, (_POSTURE_SAMPLES - 1, len(home)))]
+    z[0, arm] = home
+    z[1:, arm] = rng.uniform(lower, upper, (_POSTURE_SAMPLES - 1, len(home)))
     waypoint = problem.contacts.find_waypoint(phase)
 
     def select_free(postures: Ints) -> Ints:
@@ -190,24 +229,27 @@ def find_folded_arms(problem: TrajectoryProblem, phase: int, resting: Floats) ->
         if len(free):
             best = free[0]
             extent = np.maximum(base, reach[best])[:2]
-            others = np.flatnonzero((reach[:, :2] <= extent).all(axis=1))
-            return np.vstack([z[best, arm], z[select_free(others), arm]])
+            others = select_free(np.flatnonzero((reach[:, :2] <= extent).all(axis=1)))
+            return np.vstack([z[best, arm], z[others, arm]])
     return np.array(home[None])
 
 
 def _compute_reach(problem: TrajectoryProblem, phase: int, z: Floats) -> tuple[Floats, Floats]:
     """Return extents along the base's axes of arm and load, (B, 3), and of the base, (3,) [m]."""
     rotations, translations = problem.chain.joint_placements(z)
-    reach, base = np.zeros((len(z), 3)), np.zeros(3)
+    base_rotations = rotations[:, 1]
+    base_translations = translations[:, 1, :, None]
+    reach = np.zeros((len(z), 3))
+    base = np.zeros(3)
     for shape in _collect_moving_shapes(problem, phase):
         joint = shape.parentJoint
-        corners, radius = compute_hull_points(shape.geometry, shape.placement, outer=True)
-        at = (
-            rotations[:, joint] @ corners.T
-            + translations[:, joint, :, None]
-            - translations[:, 1, :, None]
+        points, radius = compute_hull_points(shape.geometry, shape.placement, outer=True)
+        # R₁ᵀ (R_j x + t_j − t₁) for the points x of a shape on joint j, with the base on joint 1
+        from_base = (
+            rotations[:, joint] @ points.T + translations[:, joint, :, None] - base_translations
         )
-        own = np.abs(rotations[:, 1].transpose(0, 2, 1) @ at).max(axis=2) + radius
+        in_base = base_rotations.transpose(0, 2, 1) @ from_base
+        own = np.abs(in_base).max(axis=2) + radius
         if joint > 1:
             np.maximum(reach, own, out=reach)
         else:
@@ -245,10 +287,11 @@ def collect_grid_shapes(
         moving.append((joint, (shape.geometry, carrier * shape.placement)))
     robot = part.shapes[: len(problem.chain.robot.collision.geometryObjects)]
     base = [i for i, shape in enumerate(robot) if shape.parentJoint < _ARM_BASE]
-    hits = set(part.pairs[np.isin(part.pairs[:, 0], base), 1].tolist())  # without allowed contacts
-    fixed: list[Shape] = [
-        (shape.geometry, shape.placement)
-        for i, (shape, label) in enumerate(zip(part.shapes, part.labels, strict=True))
-        if shape.parentJoint == 0 and label != FLOOR and (i in hits or not base)
-    ]
+    with_base = np.isin(part.pairs[:, 0], base)
+    paired = set(part.pairs[with_base, 1].tolist())  # without allowed contacts
+    fixed: list[Shape] = []
+    for i, (shape, label) in enumerate(zip(part.shapes, part.labels, strict=True)):
+        is_obstacle = shape.parentJoint == 0 and label != FLOOR
+        if is_obstacle and (i in paired or not base):
+            fixed.append((shape.geometry, shape.placement))
     return moving, fixed

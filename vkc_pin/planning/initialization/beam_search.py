@@ -13,7 +13,7 @@ from vkc_pin.planning.initialization.keyframes import (
     SIMILARITY_TOLERANCE,
     KeyframeSampler,
 )
-from vkc_pin.planning.nlp.pose_goals import find_approach_waypoint
+from vkc_pin.planning.nlp.pose_goals import find_approach_waypoint, find_phase_spans
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 
 _BATCHES = 6  # maximum number of batches of random samples: good grasps are rare
@@ -23,10 +23,12 @@ _ENOUGH_FREE = 60
 _KEYFRAME_SPACING = 1.0
 _BEAM_WIDTH = 24  # configurations kept per keyframe
 # cost of a collision, and of its depth [1/m]; 1 rad of a joint costs 1
-_COLLISION_COST, _DEPTH_COST = 10.0, 300.0
+_COLLISION_COST = 10.0
+_DEPTH_COST = 300.0
 _UNREACHABLE_COST = 1e3  # cost of an infeasible configuration or a missing base path
 _ACCEPTABLE_COST = 60.0  # collision cost that the solver can repair: one or two grazing contacts
-_SECTORS, _SECTOR_QUOTA = 8, 4  # sectors of base headings, and configurations preferred per sector
+_SECTORS = 8  # of base headings
+_SECTOR_QUOTA = 4  # configurations preferred per sector
 # [m] base motion between keyframes of a closed chain that surely crosses an obstacle
 _MAX_JUMP = 0.5
 
@@ -64,7 +66,12 @@ class _Continuations(NamedTuple):
 
     @staticmethod
     def concatenate(parts: Sequence[_Continuations]) -> _Continuations:
-        return _Continuations(*map(np.concatenate, zip(*parts, strict=True)))
+        """Return the continuations of all parts."""
+        return _Continuations(
+            np.concatenate([part.parents for part in parts]),
+            np.concatenate([part.z for part in parts]),
+            np.concatenate([part.penalty for part in parts]),
+        )
 
 
 class BeamSearch:
@@ -84,16 +91,16 @@ class BeamSearch:
         *,
         for_narrow_passages: bool = False,
     ) -> None:
-        self.sampler, self.problem, self.routes = sampler, sampler.problem, routes
+        self.sampler = sampler
+        self.problem = sampler.problem
+        self.routes = routes
         self.for_narrow_passages = for_narrow_passages
-        self.metric = np.sqrt(
-            self.problem.motion_cost.metric / self.problem.options.velocity_weight_arm
-        )
-        self.approaches = {
-            end: find_approach_waypoint(end - phase.segments, end, self.problem.options)
-            for phase, end in zip(self.problem.task.phases, self.problem.ends.tolist(), strict=True)
-            if phase.grasps
-        }
+        options = self.problem.options
+        self.metric = np.sqrt(self.problem.motion_cost.metric / options.velocity_weight_arm)
+        self.approaches = dict[int, int]()  # waypoint of a grasp → that of the approach to it
+        for phase, first, grasp in find_phase_spans(self.problem.task):
+            if phase.grasps:
+                self.approaches[grasp] = find_approach_waypoint(first, grasp, options)
 
     def search(
         self, *, thorough: bool, backwards: bool = False, keep_headings: bool = False
@@ -111,19 +118,22 @@ class BeamSearch:
         """
         problem = self.problem
         # A grasp with free coordinates is chosen before the object moves.
-        chosen = [grasp + 1 for _, grasp, _ in problem.choices if grasp < problem.segments]
-        backwards = backwards and not any(map(self.sampler.is_closed_at, chosen))
+        for _, grasp, _ in problem.choices:
+            if grasp < problem.segments and self.sampler.is_closed_at(grasp + 1):
+                backwards = False
         mode = _Mode(thorough, backwards, keep_headings)
         found = SearchResult(problem.start[None, None, :], np.zeros(1), np.zeros(1), [0])
-        closed = [problem.is_closed(phase) for phase in problem.task.phases]
+        is_closed = [problem.is_closed(phase) for phase in problem.task.phases]
+        count = len(is_closed)
         number = 0
-        while number < len(closed):
-            last = number
-            while backwards and not closed[number] and closed[last + 1 : last + 2] == [True]:
-                last += 1
-            keyframes = [
-                k for phase in range(number, last + 1) for k in self._place_keyframes(phase)
-            ]
+        while number < count:
+            last = number  # of an open phase and the closed ones that follow it
+            if backwards and not is_closed[number]:
+                while last + 1 < count and is_closed[last + 1]:
+                    last += 1
+            keyframes = list[int]()
+            for phase in range(number, last + 1):
+                keyframes += self._place_keyframes(phase)
             if last > number:
                 found = self._extend_backwards(found, keyframes, number, mode)
             else:
@@ -140,19 +150,24 @@ class BeamSearch:
     def is_acceptable(self, found: SearchResult) -> bool:
         """Return whether the cheapest path has few collisions and, given routes, no base jumps."""
         best = int(np.argmin(found.cost))
-        closed = [self.sampler.is_closed_at(waypoint) for waypoint in found.waypoints[1:]]
-        jumps = np.abs(np.diff(found.paths[best, :, :2], axis=0)).max(axis=1) > _MAX_JUMP
-        has_jumps = self.routes is not None and bool(np.any(jumps & closed))
-        return bool(found.collision_cost[best] <= _ACCEPTABLE_COST) and not has_jumps
+        if found.collision_cost[best] > _ACCEPTABLE_COST:
+            return False
+        if self.routes is None:
+            return True
+        is_closed = [self.sampler.is_closed_at(waypoint) for waypoint in found.waypoints[1:]]
+        motions = np.abs(np.diff(found.paths[best, :, :2], axis=0)).max(axis=1)
+        return not np.any((motions > _MAX_JUMP) & is_closed)
 
     def _is_closed(self, phase: int) -> bool:
         return self.problem.is_closed(self.problem.task.phases[phase])
 
     def _place_keyframes(self, phase: int) -> list[int]:
         """Return the waypoints of a phase's keyframes."""
-        begin, end = [0, *self.problem.ends.tolist()][phase : phase + 2]
-        steps = self.problem.options.steps(_KEYFRAME_SPACING)
-        pieces = max(1, round((end - begin) / steps)) if self._is_closed(phase) else 1
+        _, begin, end = find_phase_spans(self.problem.task)[phase]
+        pieces = 1
+        if self._is_closed(phase):
+            steps = self.problem.options.steps(_KEYFRAME_SPACING)
+            pieces = max(1, round((end - begin) / steps))
         return np.linspace(begin, end, pieces + 1).round().astype(int)[1:].tolist()
 
     def _extend(self, found: SearchResult, keyframe: int, phase: int, mode: _Mode) -> SearchResult:
@@ -182,23 +197,25 @@ class BeamSearch:
         found = self._extend(found, keyframes[-1], phase, mode)
         for keyframe in keyframes[-2::-1]:
             found = self._extend(found, keyframe, phase + 1, mode)
-        paths = np.concatenate([found.paths[:, :known], found.paths[:, : known - 1 : -1]], axis=1)
-        start, grasp, end = paths[:, known - 1], paths[:, known], paths[:, -1]
-        cost = (
-            found.cost
-            + self._compute_path_cost(start, grasp, phase)
-            - self._compute_path_cost(start, end, phase)
-        )
-        return SearchResult(
-            paths, cost, found.collision_cost, [*found.waypoints[:known], *keyframes]
-        )
+        found_backwards = found.paths[:, : known - 1 : -1]
+        paths = np.concatenate([found.paths[:, :known], found_backwards], axis=1)
+        # The search went from the start to the end first: replace this by the path to the grasp.
+        start = paths[:, known - 1]
+        grasp = paths[:, known]
+        end = paths[:, -1]
+        cost_to_grasp = self._compute_path_cost(start, grasp, phase)
+        cost_to_end = self._compute_path_cost(start, end, phase)
+        cost = found.cost + cost_to_grasp - cost_to_end
+        waypoints = [*found.waypoints[:known], *keyframes]
+        return SearchResult(paths, cost, found.collision_cost, waypoints)
 
     def _find_dead_end(self, found: SearchResult, more: _Continuations, phase: int) -> None:
         """Record the goal of an open phase if no path leads there from where paths end."""
         begin = found.waypoints[-1]
         if self.routes is None or self.for_narrow_passages or not begin:
             return
-        starts, goals = found.paths[more.parents, -1, :3], more.z[:, :3]
+        starts = found.paths[more.parents, -1, :3]
+        goals = more.z[:, :3]
         if np.isinf(self.routes.compute_distances(phase, starts, goals)).all():
             goal = goals[int(np.argmin(more.penalty))]
             self.sampler.cache.unreached.setdefault(begin, goal)
@@ -220,10 +237,13 @@ class BeamSearch:
     def _compute_path_cost(self, first: Floats, last: Floats, phase: int) -> Floats:
         """Return path lengths between configurations, both (B, n), in radians of the arm, (B,)."""
         cost = np.abs(last - first) * self.metric
-        cost[:, 0], cost[:, 1] = np.hypot(cost[:, 0], cost[:, 1]), 0.0
+        # x stands for the base's path, y for nothing.
+        cost[:, 0] = np.hypot(cost[:, 0], cost[:, 1])
+        cost[:, 1] = 0.0
         if self.sampler.curves is not None:
             lengths, turns = self.sampler.curves.compute_lengths(first[:, :3], last[:, :3])
-            cost[:, 0], cost[:, 2] = self.metric[0] * lengths, self.metric[2] * turns
+            cost[:, 0] = self.metric[0] * lengths
+            cost[:, 2] = self.metric[2] * turns
         if self.routes is not None and not self._is_closed(phase):
             distances = self.routes.compute_distances(
                 phase, first[:, :3], last[:, :3], folded=self.for_narrow_passages
@@ -231,23 +251,18 @@ class BeamSearch:
             cost[:, 0] = self.metric[0] * distances
             np.minimum(cost, _UNREACHABLE_COST, out=cost)  # paths exist for others
         elif self.routes is not None:
-            cost[:, 0] += _ACCEPTABLE_COST * (np.abs(last - first)[:, :2].max(axis=1) > _MAX_JUMP)
+            is_jump = np.abs(last - first)[:, :2].max(axis=1) > _MAX_JUMP
+            cost[:, 0] += _ACCEPTABLE_COST * is_jump
         return np.asarray(cost.sum(axis=1))
 
     def _sample_continuations(
         self, found: SearchResult, waypoint: int, phase: int, mode: _Mode
     ) -> _Continuations:
-        sampler, count = self.sampler, len(found.paths)
+        """Sample continuations of paths to a waypoint in a phase."""
+        sampler = self.sampler
+        count = len(found.paths)
         if not self._is_closed(phase):
-            samples: list[_Continuations] = []
-            parents = np.arange(SAMPLE_COUNT if mode.thorough else SAMPLE_COUNT // 2) % count
-            for _ in range(_BATCHES):
-                z, reached = sampler.sample(found.paths[parents, -1], waypoint, "scatter")
-                samples.append(self._sort_by_cost(found, parents, z, reached, waypoint, phase))
-                if sum(np.count_nonzero(part.penalty == 0) for part in samples) >= _ENOUGH_FREE:
-                    break
-            more = _Continuations.concatenate(samples)
-            return self._add_pushed(found, more, waypoint, phase)
+            return self._sample_open_continuations(found, waypoint, phase, mode)
         parents = np.arange(count)
         z, reached = sampler.sample(found.paths[:, -1], waypoint, "track")
         if not mode.thorough:
@@ -256,10 +271,31 @@ class BeamSearch:
                 return _Continuations(parents, z, penalty)
         others = np.arange(SAMPLE_COUNT // 2 - count) % count
         shaken, are_reached = sampler.sample(found.paths[others, -1], waypoint, "shake")
-        parents, z = np.concatenate([parents, others]), np.concatenate([z, shaken])
+        parents = np.concatenate([parents, others])
+        z = np.concatenate([z, shaken])
         reached = np.concatenate([reached, are_reached])
         more = self._sort_by_cost(found, parents, z, reached, waypoint, phase)
-        return self._add_pushed(found, more, waypoint, phase) if mode.backwards else more
+        if mode.backwards:
+            return self._add_pushed(found, more, waypoint, phase)
+        return more
+
+    def _sample_open_continuations(
+        self, found: SearchResult, waypoint: int, phase: int, mode: _Mode
+    ) -> _Continuations:
+        """Sample continuations in an open phase, batch by batch until enough are free."""
+        size = SAMPLE_COUNT if mode.thorough else SAMPLE_COUNT // 2
+        parents = np.arange(size) % len(found.paths)
+        batches: list[_Continuations] = []
+        free = 0
+        for _ in range(_BATCHES):
+            z, reached = self.sampler.sample(found.paths[parents, -1], waypoint, "scatter")
+            batch = self._sort_by_cost(found, parents, z, reached, waypoint, phase)
+            batches.append(batch)
+            free += int(np.count_nonzero(batch.penalty == 0))
+            if free >= _ENOUGH_FREE:
+                break
+        more = _Continuations.concatenate(batches)
+        return self._add_pushed(found, more, waypoint, phase)
 
     def _sort_by_cost(
         self,
@@ -273,7 +309,9 @@ class BeamSearch:
         """Sort continuations by cost; skip those that the beam would discard anyway."""
         cost = self._compute_total(found, parents, z, phase) + _UNREACHABLE_COST * ~reached
         order = np.argsort(cost, kind="stable")
-        parents, z, reached = parents[order], z[order], reached[order]
+        parents = parents[order]
+        z = z[order]
+        reached = reached[order]
         half = min(2 * _BEAM_WIDTH, len(z))
         penalty = self._compute_penalty(z[:half], waypoint, reached[:half])
         if np.count_nonzero(penalty == 0) >= _BEAM_WIDTH:
@@ -298,17 +336,19 @@ class BeamSearch:
         """Return the penalty for collisions and unreached poses at a waypoint, shape (B,)."""
         reached = np.ones(len(z), bool) if reached is None else reached
         penalty = np.full(len(z), _UNREACHABLE_COST)
-        if reached.any():
-            shortfall = self.sampler.compute_shortfall(z[reached], waypoint)
-            penalty[reached] = _compute_collision_cost(shortfall)
-            if self.for_narrow_passages and waypoint in self.approaches and (shortfall <= 0).any():
-                free = np.flatnonzero(reached)[shortfall <= 0]
-                at = self.approaches[waypoint]
-                near, is_near = self.sampler.sample(z[free], at, "track")
-                penalty[free] += (
-                    _compute_collision_cost(self.sampler.compute_shortfall(near, at))
-                    + _UNREACHABLE_COST * ~is_near
-                )
+        if not reached.any():
+            return penalty
+        shortfall = self.sampler.compute_shortfall(z[reached], waypoint)
+        penalty[reached] = _compute_collision_cost(shortfall)
+        is_free = shortfall <= 0
+        if self.for_narrow_passages and waypoint in self.approaches and is_free.any():
+            free = np.flatnonzero(reached)[is_free]
+            approach = self.approaches[waypoint]
+            behind, is_feasible = self.sampler.sample(z[free], approach, "track")
+            collision_cost = _compute_collision_cost(
+                self.sampler.compute_shortfall(behind, approach)
+            )
+            penalty[free] += collision_cost + _UNREACHABLE_COST * ~is_feasible
         return penalty
 
 
@@ -317,15 +357,21 @@ def _select_beam(total: Floats, z: Floats, sectors: int) -> Ints:
 
     With several heading sectors, those beyond the quota of their sector come last.
     """
-    rest, kept, late = np.argsort(total, kind="stable"), list[int](), list[int]()
-    headings = np.floor(z[:, 2] / (2 * np.pi) * sectors).astype(int) % sectors
-    count = np.zeros(sectors, int)
+    rest = np.argsort(total, kind="stable")
+    kept = list[int]()
+    beyond_quota = list[int]()
+    sector = np.floor(z[:, 2] / (2 * np.pi) * sectors).astype(int) % sectors
+    counts = np.zeros(sectors, int)
     while len(rest) and len(kept) < _BEAM_WIDTH:
         first = int(rest[0])
-        (late if sectors > 1 and count[headings[first]] >= _SECTOR_QUOTA else kept).append(first)
-        count[headings[first]] += 1
-        rest = rest[np.abs(z[rest] - z[first]).max(axis=1) > SIMILARITY_TOLERANCE]
-    return np.array(kept + late[: _BEAM_WIDTH - len(kept)])
+        if sectors > 1 and counts[sector[first]] >= _SECTOR_QUOTA:
+            beyond_quota.append(first)
+        else:
+            kept.append(first)
+        counts[sector[first]] += 1
+        is_different = np.abs(z[rest] - z[first]).max(axis=1) > SIMILARITY_TOLERANCE
+        rest = rest[is_different]
+    return np.array(kept + beyond_quota[: _BEAM_WIDTH - len(kept)])
 
 
 def _compute_collision_cost(shortfall: Floats) -> Floats:

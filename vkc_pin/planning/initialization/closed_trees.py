@@ -76,15 +76,22 @@ class _Path(NamedTuple):
 
 
 class _Tree:
+    """Nodes of a tree: configurations, (P, n), their progress and parents, (P,); -1: a root."""
+
     def __init__(self, z: Floats, at: float) -> None:
-        self.z, self.at, self.parents = z, np.full(len(z), at), np.full(len(z), -1)
+        self.z = z
+        self.at = np.full(len(z), at)
+        self.parents = np.full(len(z), -1)
 
     def add(self, z: Floats, at: Floats, parents: Ints) -> Ints:
-        self.z, self.at = np.concatenate([self.z, z]), np.concatenate([self.at, at])
+        """Add nodes; return their numbers."""
+        self.z = np.concatenate([self.z, z])
+        self.at = np.concatenate([self.at, at])
         self.parents = np.concatenate([self.parents, parents])
         return np.arange(len(self.z) - len(z), len(self.z))
 
     def trace_to_root(self, node: int) -> _Path:
+        """Return the path from a node to its root."""
         nodes = [node]
         while self.parents[nodes[-1]] >= 0:
             nodes.append(int(self.parents[nodes[-1]]))
@@ -95,13 +102,16 @@ class _ClosedSearch:
     """Searches a closed phase, with the grasp of its first configuration."""
 
     def __init__(self, sampler: KeyframeSampler, phase: int, through: Floats, steps: int) -> None:
-        self.sampler, self.problem = sampler, sampler.problem
+        self.sampler = sampler
+        self.problem = sampler.problem
         end = int(self.problem.ends[phase])
-        self.begin, self.end = float(end - steps), float(end)
+        self.begin = float(end - steps)
+        self.end = float(end)
         self.waypoint = self.problem.contacts.find_waypoint(phase)
         pose = sampler.find_pose(end)
         assert pose is not None, "a grasped articulated object closes the chain"
-        self.pose, self.through = pose, through
+        self.pose = pose
+        self.through = through
         motion = np.vstack([self.problem.start, sampler.object_motion])
         self.object_motion = motion[end - steps : end + 1, sampler.object_columns]
         self.grasp_columns = sampler.find_grasp_columns(end)
@@ -111,13 +121,14 @@ class _ClosedSearch:
 
         Returns projected configurations, and a mask of those that satisfy the constraints.
         """
-        z, columns = z.copy(), self.sampler.object_columns
-        whole = np.arange(self.begin, self.end + 1)
-        z[:, columns] = np.stack(
-            [np.interp(at, whole, column) for column in self.object_motion.T], axis=1
-        )
+        z = z.copy()
+        columns = self.sampler.object_columns
+        waypoints = np.arange(self.begin, self.end + 1)
+        positions = [np.interp(at, waypoints, column) for column in self.object_motion.T]
+        z[:, columns] = np.stack(positions, axis=1)
         lower, upper = self.sampler.compute_limits(z, self.waypoint)
-        lower[:, columns] = upper[:, columns] = z[:, columns]
+        lower[:, columns] = z[:, columns]
+        upper[:, columns] = z[:, columns]
         return self.sampler.solve_pose(z, self.pose, lower, upper)
 
     def sample(self) -> tuple[Floats, float]:
@@ -127,7 +138,8 @@ class _ClosedSearch:
 
     def sample_waypoint(self, waypoint: int) -> Floats:
         """Sample nearly collision-free configurations at a waypoint with the phase's grasp."""
-        before, found = self.through[np.arange(_SAMPLES) % len(self.through)], []
+        before = self.through[np.arange(_SAMPLES) % len(self.through)]
+        found = []
         for how in ("scatter", "shake"):
             z, closed = self.sampler.sample(before, waypoint, how)
             is_same = z[:, self.grasp_columns] == self.through[0, self.grasp_columns]
@@ -143,12 +155,15 @@ class _ClosedSearch:
         return self.compute_shortfall(z) <= self.problem.options.dist_safe
 
     def compute_shortfall(self, z: Floats) -> Floats:
+        """Return the clearance that configurations lack, shape (B,) [m]."""
         return compute_shortfall(self.problem, z, self.waypoint, reach=0.0)
 
     def compute_distances(self, z: Floats, other: Floats) -> Floats:
+        """Return the distances of configurations in the metric of searches."""
         return np.asarray(np.linalg.norm((z - other) * self.sampler.weights, axis=-1))
 
     def compute_gaps(self, z: Floats) -> Floats:
+        """Return the distances of consecutive configurations, (P, n): shape (P − 1,)."""
         return self.compute_distances(z[1:], z[:-1])
 
     def connect(self, first: Floats, ends: Floats, max_extensions: int) -> _Path | None:
@@ -158,16 +173,20 @@ class _ClosedSearch:
         """
         shortfall = self.compute_shortfall(ends)
         ends = ends[shortfall <= max(self.problem.options.dist_safe, float(shortfall.min()))]
-        one, other = _Tree(first, self.begin), _Tree(ends, self.end)
-        forwards, grown, tips = True, 0, np.zeros(1, int)
-        while grown < max_extensions:
-            path = self.try_connect(one, other, tips)
+        tree = _Tree(first, self.begin)
+        other = _Tree(ends, self.end)
+        starts_at_first = True  # whether `tree` does
+        extensions = 0
+        tips = np.zeros(1, int)
+        while extensions < max_extensions:
+            path = self.try_connect(tree, other, tips)
             if path is not None:
-                return path if forwards else _Path(path.z[::-1], path.at[::-1])
-            forwards, one, other = not forwards, other, one
+                return path if starts_at_first else _Path(path.z[::-1], path.at[::-1])
+            tree, other = other, tree
+            starts_at_first = not starts_at_first
             goals, at = self.sample()
-            tips = np.unique(self.grow(one, goals, np.full(len(goals), at)))
-            grown += max(len(goals), 1)
+            tips = np.unique(self.grow(tree, goals, np.full(len(goals), at)))
+            extensions += max(len(goals), 1)
         return None
 
     def try_connect(self, tree: _Tree, other: _Tree, tips: Ints) -> _Path | None:
@@ -179,32 +198,34 @@ class _ClosedSearch:
         best = int(np.argmin(gaps))
         if gaps[best] > _STEP:
             return None
-        here, there = tree.trace_to_root(int(tips[best])), other.trace_to_root(int(reached[best]))
-        return _Path(np.vstack([here.z[::-1], there.z]), np.concatenate([here.at[::-1], there.at]))
+        part = tree.trace_to_root(int(tips[best]))
+        other_part = other.trace_to_root(int(reached[best]))
+        return _Path(
+            np.vstack([part.z[::-1], other_part.z]),
+            np.concatenate([part.at[::-1], other_part.at]),
+        )
 
     def grow(self, tree: _Tree, goals: Floats, at: Floats) -> Ints:
         """Grow a tree step by step towards goals; return the last node of each branch, (B,)."""
-        ends = np.array(
-            [int(np.argmin(self.compute_distances(tree.z, goal))) for goal in goals], int
-        )
-        growing = np.arange(len(goals))
+        nearest = [int(np.argmin(self.compute_distances(tree.z, goal))) for goal in goals]
+        ends = np.array(nearest, int)
+        growing = np.arange(len(goals))  # branches
         while len(growing):
-            left = self.compute_distances(tree.z[ends[growing]], goals[growing])
-            growing, left = growing[left > _STEP], left[left > _STEP]
-            here, share = ends[growing], _STEP / left
-            progress = tree.at[here] + share * (at[growing] - tree.at[here])
-            moved, feasible = self.project(
-                tree.z[here] + share[:, None] * (goals[growing] - tree.z[here]), progress
-            )
-            nearer = left - self.compute_distances(moved, goals[growing])
-            good = (
-                feasible
-                & (self.compute_distances(moved, tree.z[here]) <= 2.0 * _STEP)
-                & (nearer > _STEP / 4.0)
-            )
-            good[good] = self.are_free(moved[good])
-            growing = growing[good]
-            ends[growing] = tree.add(moved[good], progress[good], here[good])
+            remaining = self.compute_distances(tree.z[ends[growing]], goals[growing])
+            is_far = remaining > _STEP
+            growing = growing[is_far]
+            remaining = remaining[is_far]
+            here = ends[growing]
+            s = _STEP / remaining
+            progress = tree.at[here] + s * (at[growing] - tree.at[here])
+            z = tree.z[here] + s[:, None] * (goals[growing] - tree.z[here])
+            moved, is_feasible = self.project(z, progress)
+            gain = remaining - self.compute_distances(moved, goals[growing])
+            is_near = self.compute_distances(moved, tree.z[here]) <= 2.0 * _STEP
+            is_good = is_feasible & is_near & (gain > _STEP / 4.0)
+            is_good[is_good] = self.are_free(moved[is_good])
+            growing = growing[is_good]
+            ends[growing] = tree.add(moved[is_good], progress[is_good], here[is_good])
         return ends
 
     def shorten(self, path: _Path) -> _Path:
@@ -214,9 +235,9 @@ class _ClosedSearch:
             count = int(np.ceil(self.compute_distances(path.z[first], path.z[last]) / _STEP))
             if not 1 < count < last - first:
                 continue
-            share = np.arange(1, count) / count
-            at = path.at[first] + share * (path.at[last] - path.at[first])
-            z = path.z[first] + share[:, None] * (path.z[last] - path.z[first])
+            s = np.arange(1, count) / count
+            at = path.at[first] + s * (path.at[last] - path.at[first])
+            z = path.z[first] + s[:, None] * (path.z[last] - path.z[first])
             path = self.replace(path, first, last, z, at)
         return path
 

@@ -63,15 +63,19 @@ def extract_phase_waypoints(
 ) -> PhaseWaypoints:
     """Return z_1..z_N of a problem, shape (N, n), as waypoints of its phases."""
     phases = tuple(phase.key for phase in problem.task.phases)
-    path, ends = problem.waypoints(z), [0, *problem.ends.tolist()]
+    path = problem.waypoints(z)
+    ends = [0, *problem.ends.tolist()]
     waypoints = tuple(path[first : last + 1] for first, last in itertools.pairwise(ends))
     return PhaseWaypoints(phases, problem.chain.names, waypoints, initialization)
 
 
 def make_initial_guess(problem: TrajectoryProblem, parts: Sequence[PhaseWaypoints]) -> InitialGuess:
     """Concatenate waypoints of parts of a task to an initial guess for the whole task."""
-    chain, phases = problem.chain, iter(problem.task.phases)
-    z, begin, phase = np.full((problem.segments, chain.size), np.nan), 0, next(phases, None)
+    chain = problem.chain
+    phases = iter(problem.task.phases)
+    phase = next(phases, None)
+    begin = 0
+    z = np.full((problem.segments, chain.size), np.nan)
     for part in parts:
         # The other coordinates belong to objects that are no longer attached.
         known = [k for k, name in enumerate(part.names) if name in chain.names]
@@ -81,7 +85,8 @@ def make_initial_guess(problem: TrajectoryProblem, parts: Sequence[PhaseWaypoint
             if phase is not None and key == phase.key:
                 end = begin + phase.segments
                 z[begin:end, columns] = _resample(waypoints[:, known], phase.segments)
-                begin, phase = end, next(phases, None)
+                begin = end
+                phase = next(phases, None)
     z = fill_missing_values(z)
     z = np.where(np.isnan(z), problem.start, z)  # coordinates that no part moves
     name = ", ".join(part.initialization for part in parts) + ", then all at once"
@@ -93,9 +98,9 @@ def _resample(waypoints: Floats, segments: int) -> Floats:
     if len(waypoints) == segments + 1:
         return waypoints[1:]
     at = np.linspace(0.0, len(waypoints) - 1, segments + 1)[1:]
-    return np.stack(
-        [np.interp(at, np.arange(len(waypoints)), column) for column in waypoints.T], axis=1
-    )
+    numbers = np.arange(len(waypoints))
+    columns = [np.interp(at, numbers, column) for column in waypoints.T]
+    return np.stack(columns, axis=1)
 
 
 def perturb(
@@ -103,13 +108,14 @@ def perturb(
 ) -> Floats:
     """Add smooth noise of some standard deviation [m] or [rad] to the robot's part of z, (N, n).
 
-    Noise is a sum of sine half-waves with amplitudes ∝ length².
+    Noise at waypoint t is Σ_k a_k sin(π k t/(N + 1))/k², zero at both ends, with random amplitudes
+    a_k. The mean square of a sine is 1/2, so that the variance is Σ_k 1/(2 k⁴) times theirs.
     """
-    robot, waves = problem.chain.robot.coordinates.size, np.arange(1, len(z) + 1)
+    robot = problem.chain.robot.coordinates.size
+    waves = np.arange(1, len(z) + 1)  # k, and also t
     shape = np.sin(np.pi * np.outer(waves / (len(z) + 1), waves)) / waves**2
-    noise = (
-        shape @ rng.normal(0.0, deviation, (len(waves), robot)) / np.sqrt(np.sum(0.5 / waves**4))
-    )
+    amplitudes = rng.normal(0.0, deviation, (len(waves), robot))
+    noise = shape @ amplitudes / np.sqrt(np.sum(0.5 / waves**4))
     z = z.copy()
     z[:, :robot] += noise
     return problem.clip(z)

@@ -16,6 +16,7 @@ from vkc_pin.planning.initialization.closed_trees import (
 )
 from vkc_pin.planning.initialization.keyframes import KeyframeSampler, sample_smoothstep
 from vkc_pin.planning.initialization.open_trees import Guide, OpenSearch
+from vkc_pin.planning.nlp.pose_goals import find_phase_spans
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.task.phases import Phase
 
@@ -71,7 +72,9 @@ class RrtPaths:
     """Paths of base and arm by RRT: guided by a base path, or constrained to a closed chain."""
 
     def __init__(self, sampler: KeyframeSampler, routes: BaseRoutes, *, effort: int = 1) -> None:
-        self.sampler, self.problem, self.routes = sampler, sampler.problem, routes
+        self.sampler = sampler
+        self.problem = sampler.problem
+        self.routes = routes
         self.effort = effort  # factor of the collision checks
         self._failures: Counter[int] = Counter()  # consecutive ones per phase
         # Configurations at which the motion may end, shape (E, n).
@@ -83,8 +86,11 @@ class RrtPaths:
         self, phase: int, first: Floats, last: Floats, steps: int, *, turns: bool, reaches: bool
     ) -> Floats | None:
         """See `AStarPaths.find_path`."""
-        problem, size = self.problem, self.sampler.robot_size
-        self.obstruction, guide, last = None, None, last.copy()
+        problem = self.problem
+        size = self.sampler.robot_size
+        self.obstruction = None
+        guide = None
+        last = last.copy()
         if problem.chain.robot.base == "fixed":
             arms = np.array([last[3:size], first[3:size], problem.chain.robot.home])
         else:
@@ -92,11 +98,11 @@ class RrtPaths:
             poses = self.routes.find_guide_path(phase, first[:3], last[:3], 2 * steps)
             if poses is None:
                 return None
-            turned = 2 * np.pi * np.rint((poses[-1, 2] - last[2]) / (2 * np.pi))
+            full_turns = 2 * np.pi * np.rint((poses[-1, 2] - last[2]) / (2 * np.pi))
             if turns:
-                last[2] += turned
+                last[2] += full_turns
             else:
-                poses[:, 2] -= turned  # the trees find where the base can turn
+                poses[:, 2] -= full_turns  # the trees find where the base can turn
             guide = Guide(poses, arms)
         if not reaches:
             ends = self._list_ends(phase, last, arms)
@@ -104,13 +110,17 @@ class RrtPaths:
             ends = self._list_final_ends(last)
         else:
             ends = last[None]
-        number = self._failures[phase]
-        allowed = 0.0 if number % 2 else problem.options.dist_safe
+        # Every other attempt allows no shortfall, and pairs of attempts get twice the checks.
+        failures = self._failures[phase]
+        allowed = 0.0 if failures % 2 else problem.options.dist_safe
+        max_checks = self.effort * FIRST_CHECKS * 2 ** (failures // 2)
         search = OpenSearch(self.sampler, phase, first, ends, guide, allowed=allowed)
-        path = search.find_path(steps, self.effort * FIRST_CHECKS * 2 ** (number // 2))
+        path = search.find_path(steps, max_checks)
         self._count_failures(phase, path)
-        self.obstruction = search.find_obstruction() if path is None else None
-        return None if path is None else path[:, :size]
+        if path is None:
+            self.obstruction = search.find_obstruction()
+            return None
+        return path[:, :size]
 
     def _list_postures(self, phase: int, start: Floats, goal: Floats) -> Floats:
         """Return postures that are likely to be needed between two of them, shape (A, m - 3)."""
@@ -128,7 +138,8 @@ class RrtPaths:
 
     def _list_final_ends(self, last: Floats) -> Floats:
         """Return the final ends that differ from `last`, one of them, in the robot alone."""
-        size, ends = self.sampler.robot_size, self.final_ends
+        size = self.sampler.robot_size
+        ends = self.final_ends
         if not (ends == last).all(axis=1).any():
             return last[None]
         return np.asarray(ends[(ends[:, size:] == last[size:]).all(axis=1)])
@@ -147,7 +158,11 @@ class RrtPaths:
         return max(1, MAX_EXTENSIONS // 2 ** self._failures[phase])
 
     def _count_failures(self, phase: int, path: Floats | None) -> None:
-        self._failures[phase] = 0 if path is not None else self._failures[phase] + 1
+        """Count the consecutive failures in a phase."""
+        if path is None:
+            self._failures[phase] += 1
+        else:
+            self._failures[phase] = 0
 
 
 Paths = CurvePaths | AStarPaths | RrtPaths
@@ -175,8 +190,10 @@ class Interpolator:
     def __init__(
         self, sampler: KeyframeSampler, approach: ApproachPaths, paths: Paths | None
     ) -> None:
-        self.sampler, self.problem = sampler, sampler.problem
-        self.approach, self.paths = approach, paths
+        self.sampler = sampler
+        self.problem = sampler.problem
+        self.approach = approach
+        self.paths = paths
         self.blocked: list[str] = []
 
     def interpolate(self, through: Floats, at: list[int]) -> Floats | None:
@@ -193,25 +210,22 @@ class Interpolator:
         keyframes = through.copy()
         objects = self.sampler.object_motion.copy()
         z = np.empty((problem.segments, problem.chain.size))
-        begin, previous = 0, None
-        for number, (phase, end) in enumerate(
-            zip(problem.task.phases, problem.ends.tolist(), strict=True)
-        ):
+        previous = None
+        for number, (phase, begin, end) in enumerate(find_phase_spans(problem.task)):
             inside = [k for k, waypoint in enumerate(at) if begin <= waypoint <= end]
             rows = z[begin:end]
             if problem.is_closed(phase):
                 self._fill_straight(rows, keyframes[inside], [at[k] - begin for k in inside])
-                path = (
-                    self.paths.find_closed_path(number, keyframes[inside], rows)
-                    if isinstance(self.paths, RrtPaths)
-                    else None
-                )
+                path = None
+                if isinstance(self.paths, RrtPaths):
+                    path = self.paths.find_closed_path(number, keyframes[inside], rows)
                 if path is not None:
-                    rows[:] = objects[begin:end] = path
+                    rows[:] = path
+                    objects[begin:end] = path
                     keyframes[inside[-1]] = path[-1]
             elif not self._fill_open_phase(rows, keyframes, inside, number, previous):
                 return None
-            begin, previous = end, phase
+            previous = phase
         self._close_chain(z, problem.clip(objects))
         return problem.clip(z)
 
@@ -222,8 +236,8 @@ class Interpolator:
             z[:, column] = np.interp(s[1:], s[when], through[:, column])
         if self.sampler.curves is not None:
             at = np.interp(s[1:], s[when], np.arange(len(when)))
-            leg = np.minimum(at.astype(int), len(when) - 2)
-            z[:, :3] = interpolate_arcs(through[leg, :3], through[leg + 1, :3], at - leg)
+            piece = np.minimum(at.astype(int), len(when) - 2)
+            z[:, :3] = interpolate_arcs(through[piece, :3], through[piece + 1, :3], at - piece)
 
     def _fill_open_phase(
         self, z: Floats, keyframes: Floats, inside: list[int], number: int, previous: Phase | None
@@ -232,7 +246,8 @@ class Interpolator:
 
         Its start and its end are keyframes `inside`.
         """
-        problem, phase = self.problem, self.problem.task.phases[number]
+        problem = self.problem
+        phase = problem.task.phases[number]
         end = int(problem.ends[number])
         through, when, leave, arrive = self._find_via_points(
             keyframes[inside], number, previous, len(z)
@@ -249,9 +264,10 @@ class Interpolator:
             if path is None:
                 self._note_missing_path(phase, *through[[leave, arrive], :2])
                 return False
-            turned = path[-1, 2] - through[arrive, 2]  # later headings continue from there
-            through[arrive:, 2] += turned
-            keyframes[inside[-1] :, 2] += turned
+            # Later headings continue from there.
+            full_turns = path[-1, 2] - through[arrive, 2]
+            through[arrive:, 2] += full_turns
+            keyframes[inside[-1] :, 2] += full_turns
         self._fill_straight(z, through, when)
         if path is not None:
             z[when[leave] : when[arrive], : path.shape[1]] = path
@@ -265,8 +281,7 @@ class Interpolator:
         if any(note.startswith(text) for note in self.blocked):
             return
         if not is_fixed:
-            (x, y), (u, v) = start, end
-            text += f" from ({x:.2f}, {y:.2f}) to ({u:.2f}, {v:.2f})"
+            text += f" from ({start[0]:.2f}, {start[1]:.2f}) to ({end[0]:.2f}, {end[1]:.2f})"
         if isinstance(self.paths, RrtPaths) and self.paths.obstruction is not None:
             first, second = self.paths.obstruction
             text += f": between start and goal, {first} meets {second}"
@@ -280,35 +295,47 @@ class Interpolator:
         Returns configurations, shape (K, n), their waypoints from 0, and the indices of those
         between which the path is neither retreat nor approach.
         """
-        phase, options = self.problem.task.phases[number], self.problem.options
-        first = self.approach.find_retreat_end(ends[0], phase, previous)
-        last = self.approach.find_approach_start(ends[1], phase)
+        phase = self.problem.task.phases[number]
+        options = self.problem.options
+        retreat = self.approach.find_retreat_end(ends[0], phase, previous)
+        approach = self.approach.find_approach_start(ends[1], phase)
         if isinstance(self.paths, RrtPaths):  # which avoid collisions elsewhere
             waypoint = self.problem.contacts.find_waypoint(number)
-            first, last = (
-                part[: len(part) if self._is_free(part, waypoint) else 0] for part in (first, last)
-            )
+            if not self._is_free(retreat, waypoint):
+                retreat = retreat[:0]
+            if not self._is_free(approach, waypoint):
+                approach = approach[:0]
         steps = options.steps(options.approach_time)
-        spacing = max(1, min(steps, segments // (2 * max(len(first) + len(last), 1))))
-        when = [0, *(spacing * (1 + k) for k in range(len(first)))]
-        when += [*(segments - spacing * (len(last) - k) for k in range(len(last))), segments]
-        return np.vstack([ends[:1], first, last, ends[1:]]), when, len(first), len(first) + 1
+        via_points = len(retreat) + len(approach)
+        spacing = max(1, min(steps, segments // (2 * max(via_points, 1))))
+        when = [0]
+        when += [spacing * (1 + k) for k in range(len(retreat))]
+        when += [segments - spacing * (len(approach) - k) for k in range(len(approach))]
+        when.append(segments)
+        through = np.vstack([ends[:1], retreat, approach, ends[1:]])
+        return through, when, len(retreat), len(retreat) + 1
 
     def _is_free(self, z: Floats, waypoint: int) -> bool:
-        shortfall = self.sampler.compute_shortfall(z, waypoint) if len(z) else np.zeros(0)
+        """Return whether configurations, shape (K, n), keep at least half their clearance."""
+        if not len(z):
+            return True
+        shortfall = self.sampler.compute_shortfall(z, waypoint)
         return bool(np.all(shortfall < self.problem.options.dist_safe / 2))
 
     def _close_chain(self, z: Floats, objects: Floats) -> None:
         """Set object joints in z, shape (N, n), to those of `objects`, and solve the closures."""
-        problem, columns = self.problem, self.sampler.object_columns
+        problem = self.problem
+        columns = self.sampler.object_columns
         z[:, columns] = objects[:, columns]
         for pose, row in enumerate(problem.transcription.structure.poses):
             if len(row.waypoints) > 1:
                 rows = np.array(row.waypoints) - 1
-                lower, upper = problem.lower[rows].copy(), problem.upper[rows].copy()
-                lower[:, columns] = upper[:, columns] = objects[np.ix_(rows, columns)]
-                if self.sampler.curves is not None:
-                    lower[:, :3] = upper[:, :3] = z[rows, :3]
+                lower = problem.lower[rows].copy()
+                upper = problem.upper[rows].copy()
+                for limits in (lower, upper):
+                    limits[:, columns] = objects[np.ix_(rows, columns)]
+                    if self.sampler.curves is not None:
+                        limits[:, :3] = z[rows, :3]  # the base stays on its arcs
                 z[rows], _ = self.sampler.solve_pose(
                     z[rows], pose, lower, upper, iterations=6, tolerance=1e-6
                 )

@@ -18,7 +18,9 @@ from vkc_pin.world.scene.clearance_exemptions import ACCEPTED_SHORTFALL
 SIMILARITY_TOLERANCE = 0.1  # [m], [rad] within which configurations are treated as the same
 SAMPLE_COUNT = 192  # random start configurations of inverse kinematics per keyframe
 _PUSHING_STEPS = 10  # maximum number of steps out of collision
-_SCATTER = (0.1, 2.0)  # standard deviations of scattered configurations, [m] and [rad]
+# least and largest standard deviations of configurations [m] and [rad]
+_SCATTER = (0.1, 2.0)
+_SHAKE = (0.05, 0.5)
 _DAMPING = 3e-4  # added to the diagonal of their normal equations
 _RowCache = dict[tuple[int, bytes], Floats]  # by waypoint and configuration
 
@@ -51,9 +53,10 @@ def _look_up_rows(
     if not len(z):
         return compute(z)
     keys = [(waypoint, row.tobytes()) for row in z]
-    new = [k for k, key in enumerate(keys) if key not in known]
-    if new:
-        known.update(zip((keys[k] for k in new), compute(z[new]), strict=True))
+    new_rows = [k for k, key in enumerate(keys) if key not in known]
+    if new_rows:
+        new_keys = [keys[k] for k in new_rows]
+        known.update(zip(new_keys, compute(z[new_rows]), strict=True))
     return np.array([known[key] for key in keys])
 
 
@@ -79,14 +82,17 @@ class KeyframeSampler:
         rng: np.random.Generator,
         cache: KeyframeCache | None = None,
     ) -> None:
-        self.problem, self.chain, self.rng = problem, problem.chain, rng
+        self.problem = problem
+        self.chain = problem.chain
+        self.rng = rng
         self.cache = KeyframeCache() if cache is None else cache
         self.robot_size = self.chain.robot.coordinates.size
         self.weights = self.chain.metric.copy()
         # Also where a grasp slides.
         self.weights[[column for column, _, _ in problem.choices]] = 1.0
-        rolling, lever = problem.rolling, self.chain.robot.lever
-        self.curves = None if rolling.is_omnidirectional else Curves(rolling.turning_radius, lever)
+        self.curves: Curves | None = None
+        if not problem.rolling.is_omnidirectional:
+            self.curves = Curves(problem.rolling.turning_radius, self.chain.robot.lever)
         self.object_columns = np.array([self.chain.index(name) for name in problem.task.state], int)
         self.object_motion = interpolate_object_joints(problem, problem.still)
 
@@ -112,7 +118,8 @@ class KeyframeSampler:
     def compute_residual(self, z: Floats, pose: int) -> Floats:
         """Return the largest residual of a pose constraint, shape (B,) [m] or [rad]."""
         solver, target = self.get_pose_solver(pose)
-        return np.asarray(np.abs(solver.evaluate(z, target)[0]).max(axis=1))
+        residual, _ = solver.evaluate(z, target)
+        return np.asarray(np.abs(residual).max(axis=1))
 
     def sample(self, before: Floats, waypoint: int, how: str) -> tuple[Floats, Bools]:
         """Sample configurations for a waypoint.
@@ -128,14 +135,18 @@ class KeyframeSampler:
         """
         if how != "scatter":
             return self._sample(before, waypoint, how)
-        generator, known = self.rng.bit_generator, self.cache.samples
+        generator = self.rng.bit_generator
+        known = self.cache.samples
         key = (str(generator.state), waypoint, before.tobytes())
         if key not in known:
-            known[key] = (*self._sample(before, waypoint, how), generator.state)
-        z, found, generator.state = known[key]
-        return z.copy(), found.copy()
+            z, is_feasible = self._sample(before, waypoint, how)
+            known[key] = (z, is_feasible, generator.state)
+        z, is_feasible, state = known[key]
+        generator.state = state
+        return z.copy(), is_feasible.copy()
 
     def _sample(self, before: Floats, waypoint: int, how: str) -> tuple[Floats, Bools]:
+        """Sample configurations for a waypoint, uncached; see `sample`."""
         z = before.copy()
         z[:, self.object_columns] = self.object_motion[waypoint - 1, self.object_columns]
         lower, upper = self.compute_limits(before, waypoint)
@@ -147,19 +158,22 @@ class KeyframeSampler:
         # Random grasps; half of the arms near home, the others near the preceding configuration.
         if how == "scatter":
             phase = self.problem.task.phases[int(np.searchsorted(self.problem.ends, waypoint))]
-            for name in (name for hold in phase.grasps for name in self.chain.virtual[hold]):
-                column = self.chain.index(name)
-                low, high = self.chain.lower[column], self.chain.upper[column]
-                z[:, column] = self.rng.uniform(low, high, len(z))
+            for hold in phase.grasps:
+                for name in self.chain.virtual[hold]:
+                    column = self.chain.index(name)
+                    low = self.chain.lower[column]
+                    high = self.chain.upper[column]
+                    z[:, column] = self.rng.uniform(low, high, len(z))
             z[::2, 3 : self.robot_size] = self.chain.robot.home
-        if how != "track":
-            z = self._perturb_arms(z, pose, _SCATTER if how == "scatter" else (0.05, 0.5))
-        z, found = self.solve_pose(z, pose, lower, upper)
+            z = self._perturb_arms(z, pose, _SCATTER)
+        elif how == "shake":
+            z = self._perturb_arms(z, pose, _SHAKE)
+        z, is_feasible = self.solve_pose(z, pose, lower, upper)
         if how == "scatter":
             z = self._unwrap_angles(z, before, lower, upper)
         elif self.curves is not None and self.is_closed_at(waypoint):
-            z, found = self._fit_base_to_arc(z, before, waypoint, pose)
-        return z, found
+            z, is_feasible = self._fit_base_to_arc(z, before, waypoint, pose)
+        return z, is_feasible
 
     def _is_blocked(self, z: Floats, waypoint: int) -> bool:
         """Return whether all of some configurations, shape (B, n), are in collision."""
@@ -167,21 +181,29 @@ class KeyframeSampler:
 
     def _scatter_robots(self, z: Floats) -> Floats:
         """Perturb all coordinates of robots, by up to a few metres and radians, shape (B, n)."""
-        spread, z = self.rng.uniform(*_SCATTER, (len(z), 1)), z.copy()
-        z[:, : self.robot_size] += spread * self.rng.normal(size=(len(z), self.robot_size))
+        deviations = self.rng.uniform(*_SCATTER, (len(z), 1))
+        noise = self.rng.normal(size=(len(z), self.robot_size))
+        z = z.copy()
+        z[:, : self.robot_size] += deviations * noise
         return z
 
     def _fit_base_to_arc(
         self, z: Floats, before: Floats, waypoint: int, pose: int
     ) -> tuple[Floats, Bools]:
         """Move the bases to the nearest pose on an arc from `before`, if the arms still reach."""
-        radius, turning = self.problem.rolling.turning_radius, self.chain.robot.lever
-        near = z.copy()
-        near[:, :3] = find_nearest_arc(before[:, :3], z[:, :3], radius=radius, turning=turning)
+        on_arc = z.copy()
+        on_arc[:, :3] = find_nearest_arc(
+            before[:, :3],
+            z[:, :3],
+            radius=self.problem.rolling.turning_radius,
+            turning=self.chain.robot.lever,
+        )
         lower, upper = self.compute_limits(before, waypoint)
-        lower[:, :3] = upper[:, :3] = np.clip(near[:, :3], lower[:, :3], upper[:, :3])
-        near, reached = self.solve_pose(near, pose, lower, upper)
-        return np.where(reached[:, None], near, z), reached
+        bases = np.clip(on_arc[:, :3], lower[:, :3], upper[:, :3])
+        lower[:, :3] = bases
+        upper[:, :3] = bases
+        on_arc, is_reached = self.solve_pose(on_arc, pose, lower, upper)
+        return np.where(is_reached[:, None], on_arc, z), is_reached
 
     def is_closed_at(self, waypoint: int) -> bool:
         """Return whether the chain is closed in the phase of a waypoint."""
@@ -193,9 +215,11 @@ class KeyframeSampler:
         pose = self.find_pose(waypoint)
         if pose is None:
             return z
-        return _look_up_rows(
-            self.cache.pushed, lambda rows: self._push_clear(rows, waypoint, pose), z, waypoint
-        )
+
+        def push(rows: Floats) -> Floats:
+            return self._push_clear(rows, waypoint, pose)
+
+        return _look_up_rows(self.cache.pushed, push, z, waypoint)
 
     def _push_clear(self, z: Floats, waypoint: int, pose: int) -> Floats:
         """Move configurations out of collision with a few damped Gauss-Newton steps.
@@ -203,15 +227,25 @@ class KeyframeSampler:
         Each step drives the residuals of the pose to zero and violated contacts to their margins,
         both linearized: with the witness points fixed in their bodies, the gradient of a distance
         d = n·(b − a) is n·(∂b − ∂a). It aims at `Options.dist_safe` beyond the margins, considers
-        the `Options.contact_slots` nearest contacts, and is limited to `MAX_STEP`.
+        the `Options.contact_slots` nearest contacts, and is limited to `MAX_STEP`. With the
+        Jacobian A of residuals and distances, their required changes r and the inverse weights S,
+        zero for fixed coordinates,
+
+            δz = S Aᵀ (A S Aᵀ + λI)⁻¹ r
         """
-        problem, options = self.problem, self.problem.options
+        problem = self.problem
+        options = problem.options
         lower, upper = self.compute_limits(z, waypoint)
         if self.curves is not None and self.is_closed_at(waypoint):
-            lower[:, :3] = upper[:, :3] = z[:, :3]  # the base stays on its arc
+            # The base stays on its arc.
+            lower[:, :3] = z[:, :3]
+            upper[:, :3] = z[:, :3]
         solver, target = self.get_pose_solver(pose)
-        z, at, margin = z.copy(), np.arange(len(z)), options.dist_safe
-        free, slots = (upper - lower > 1e-9) / self.weights, options.contact_slots
+        z = z.copy()
+        at = np.arange(len(z))  # configurations that are not done
+        margin = options.dist_safe
+        slots = options.contact_slots
+        inverse_weights = (upper - lower > 1e-9) / self.weights
         for _ in range(_PUSHING_STEPS):
             if not len(at):
                 break
@@ -222,39 +256,40 @@ class KeyframeSampler:
                 nearest=slots,
             )
             residual, pose_rows = solver.evaluate(z[at], target)
-            is_done = (contacts.compute_shortfall(len(at)) <= 0.0) & (
-                np.abs(residual).max(axis=1) < TOLERANCE
-            )
+            is_clear = contacts.compute_shortfall(len(at)) <= 0.0
+            is_reached = np.abs(residual).max(axis=1) < TOLERANCE
+            is_done = is_clear & is_reached
             # Gradients of the nearest distances, and their required increase [m].
-            rows, growth = np.zeros((len(at), slots, z.shape[1])), np.zeros((len(at), slots))
+            distance_rows = np.zeros((len(at), slots, z.shape[1]))
             gradients = problem.contacts.compute_gradients(z[at], contacts)
-            rows[contacts.waypoint, contacts.slot] = gradients
-            growth[contacts.waypoint, contacts.slot] = np.maximum(
-                contacts.margin + margin - contacts.distance, 0.0
-            )
-            jacobian = np.concatenate([pose_rows, rows], axis=1)
-            wanted = np.concatenate([-residual, growth], axis=1)
-            scaled = jacobian * free[at][:, None, :]
+            distance_rows[contacts.waypoint, contacts.slot] = gradients
+            increase = np.zeros((len(at), slots))
+            shortfall = np.maximum(contacts.margin + margin - contacts.distance, 0.0)
+            increase[contacts.waypoint, contacts.slot] = shortfall
+            jacobian = np.concatenate([pose_rows, distance_rows], axis=1)
+            required = np.concatenate([-residual, increase], axis=1)
+            scaled = jacobian * inverse_weights[at][:, None, :]
             system = scaled @ jacobian.transpose(0, 2, 1) + _DAMPING * np.eye(jacobian.shape[1])
-            multipliers = np.linalg.solve(system, wanted[..., None])[..., 0]
+            multipliers = np.linalg.solve(system, required[..., None])[..., 0]
             step = np.einsum("bij,bi->bj", scaled, multipliers)
             size = np.abs(step).max(axis=1, keepdims=True)
             step *= np.minimum(1.0, MAX_STEP / np.maximum(size, 1e-12))
             step[is_done] = 0.0
             z[at] = np.clip(z[at] + step, lower[at], upper[at])
             at = at[~is_done]
-        return self.solve_pose(z, pose, lower, upper, iterations=3)[0]
+        z, _ = self.solve_pose(z, pose, lower, upper, iterations=3)
+        return z
 
     def compute_limits(self, before: Floats, waypoint: int) -> tuple[Floats, Floats]:
         """Return limits at a waypoint after configurations `before`, shape (B, n) each."""
-        row, objects = waypoint - 1, self.object_columns
-        lower, upper = (
-            np.tile(limits[row], (len(before), 1))
-            for limits in (self.problem.lower, self.problem.upper)
-        )
-        lower[:, objects] = upper[:, objects] = self.object_motion[row, objects]
+        row = waypoint - 1
+        objects = self.object_columns
         grasp = self.find_grasp_columns(waypoint)
-        lower[:, grasp] = upper[:, grasp] = before[:, grasp]
+        lower = np.tile(self.problem.lower[row], (len(before), 1))
+        upper = np.tile(self.problem.upper[row], (len(before), 1))
+        for limits in (lower, upper):
+            limits[:, objects] = self.object_motion[row, objects]
+            limits[:, grasp] = before[:, grasp]
         return lower, upper
 
     def find_grasp_columns(self, waypoint: int) -> list[int]:
@@ -263,18 +298,22 @@ class KeyframeSampler:
 
     def _perturb_arms(self, z: Floats, pose: int, deviations: tuple[float, float]) -> Floats:
         """Perturb the arms by a random deviation, and align the bases with a pose constraint."""
-        spread, z = self.rng.uniform(*deviations, (len(z), 1)), z.copy()
+        deviation = self.rng.uniform(*deviations, (len(z), 1))
         noise = self.rng.normal(0.0, 1.0, (len(z), self.robot_size - 3))
-        z[:, 3 : self.robot_size] += spread * noise
+        z = z.copy()
+        z[:, 3 : self.robot_size] += deviation * noise
         return self._align_bases(np.clip(z, self.chain.lower, self.chain.upper), pose)
 
     def _align_bases(self, z: Floats, pose: int) -> Floats:
         """Move the bases so that a pose constraint holds in position and heading.
 
         Height and tilt are left to the arm. A base motion multiplies the frame's placement from the
-        left, so it equals the error T* T⁻¹, projected to the floor.
+        left, so it equals the error T* T⁻¹, projected to the floor: of the rotation E = R*Rᵀ that
+        is the turn by atan2(E_yx − E_xy, E_xx + E_yy). A base at p, with the frame at t, moves to
+        t* + turn·(p − t).
         """
-        row, target = self.problem.transcription.structure.poses[pose], self.problem.targets[pose]
+        row = self.problem.transcription.structure.poses[pose]
+        target = self.problem.targets[pose]
         rotations, translations = self.chain.joint_placements(z)
         rotation = rotations[:, row.joint] @ row.local.rotation
         translation = rotations[:, row.joint] @ row.local.translation + translations[:, row.joint]
@@ -283,44 +322,44 @@ class KeyframeSampler:
             turn = np.arctan2(error[:, 1, 0] - error[:, 0, 1], error[:, 0, 0] + error[:, 1, 1])
         else:  # any heading will do
             turn = self.rng.uniform(-np.pi, np.pi, len(z))
-        cos, sin = np.cos(turn), np.sin(turn)
+        cos = np.cos(turn)
+        sin = np.sin(turn)
         planar = np.stack([np.stack([cos, -sin], axis=1), np.stack([sin, cos], axis=1)], axis=1)
         z = z.copy()
-        z[:, :2] = target.translation[:2] + np.einsum(
-            "bij,bj->bi", planar, z[:, :2] - translation[:, :2]
-        )
+        base_from_frame = z[:, :2] - translation[:, :2]
+        turned = np.einsum("bij,bj->bi", planar, base_from_frame)
+        z[:, :2] = target.translation[:2] + turned
         z[:, 2] += turn
         return z
 
     def _unwrap_angles(self, z: Floats, before: Floats, lower: Floats, upper: Floats) -> Floats:
         """Replace each revolute robot joint's angle by the equivalent one nearest to `before`."""
-        turns = [
-            column
-            for column in range(2, self.robot_size)
-            if self.problem.unit(self.chain.names[column]) != "m"
-        ]
-        z, angle, start = z.copy(), z[:, turns], before[:, turns]
+        revolute = []
+        for column in range(2, self.robot_size):
+            if self.problem.unit(self.chain.names[column]) != "m":
+                revolute.append(column)
+        angle = z[:, revolute]
+        start = before[:, revolute]
         nearest = start + (angle - start + np.pi) % (2 * np.pi) - np.pi
-        is_inside = (nearest >= lower[:, turns]) & (nearest <= upper[:, turns])
-        z[:, turns] = np.where(is_inside, nearest, angle)
+        is_inside = (nearest >= lower[:, revolute]) & (nearest <= upper[:, revolute])
+        z = z.copy()
+        z[:, revolute] = np.where(is_inside, nearest, angle)
         return z
 
     def compute_shortfall(self, z: Floats, waypoint: int) -> Floats:
         """Return the clearance shortfall of each configuration, shape (B,) [m]."""
-        return _look_up_rows(
-            self.cache.shortfalls,
-            lambda rows: compute_shortfall(self.problem, rows, waypoint),
-            z,
-            waypoint,
-        )
+
+        def compute(rows: Floats) -> Floats:
+            return compute_shortfall(self.problem, rows, waypoint)
+
+        return _look_up_rows(self.cache.shortfalls, compute, z, waypoint)
 
     def has_free_keyframe(self, waypoint: int) -> bool:
         """Return whether a search found a collision-free, feasible configuration for a waypoint."""
-        rows = [
-            np.frombuffer(row)
-            for (at, row), shortfall in self.cache.shortfalls.items()
-            if at == waypoint and shortfall <= ACCEPTED_SHORTFALL
-        ]
+        rows = []
+        for (at, row), shortfall in self.cache.shortfalls.items():
+            if at == waypoint and shortfall <= ACCEPTED_SHORTFALL:
+                rows.append(np.frombuffer(row))
         pose = self.find_pose(waypoint)
         if pose is None or not rows:
             return bool(rows)
@@ -386,12 +425,14 @@ def sample_goal_configurations(
         low, high = np.clip([lower[column], upper[column]], -np.pi, np.pi)
         z[:, column] = rng.uniform(low, high, SAMPLE_COUNT)
     if pose is not None:
-        z, found = sampler.sample(z, waypoint, "scatter")
+        z, is_feasible = sampler.sample(z, waypoint, "scatter")
         pushed = z.copy()
-        pushed[found] = sampler.push_clear(z[found], waypoint)
-        before, after = (sampler.compute_residual(rows, pose) for rows in (z, pushed))
-        kept = after < TOLERANCE  # where the pushed configuration is still feasible
-        return np.where(kept[:, None], pushed, z), np.where(kept, after, before)
+        pushed[is_feasible] = sampler.push_clear(z[is_feasible], waypoint)
+        residual = sampler.compute_residual(z, pose)
+        pushed_residual = sampler.compute_residual(pushed, pose)
+        stays_feasible = pushed_residual < TOLERANCE
+        z = np.where(stays_feasible[:, None], pushed, z)
+        return z, np.where(stays_feasible, pushed_residual, residual)
     if (lower[:2] < upper[:2]).any():
         return None
     z[:, 2:] += rng.normal(0.0, 1.0, z[:, 2:].shape)
@@ -406,14 +447,14 @@ def sample_smoothstep(steps: int) -> Floats:
 
 def interpolate_object_joints(problem: TrajectoryProblem, z: Floats) -> Floats:
     """Move the object joints in z, shape (N, n), to their goals phase by phase."""
-    begin, current = 0, problem.start.copy()
+    begin = 0
+    current = problem.start.copy()
     for phase, end in zip(problem.task.phases, problem.ends, strict=True):
         for name in phase.initial_values:
             column = problem.chain.index(name)
-            goal = problem.lower[end - 1, column] if name in phase.values else current[column]
-            z[begin:end, column] = current[column] + (goal - current[column]) * sample_smoothstep(
-                end - begin
-            )
+            start = current[column]
+            goal = problem.lower[end - 1, column] if name in phase.values else start
+            z[begin:end, column] = start + (goal - start) * sample_smoothstep(end - begin)
             current[column] = goal
         begin = end
     return problem.clip(z)

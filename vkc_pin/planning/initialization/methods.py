@@ -68,24 +68,22 @@ def initialize(
         guesses = _generate_stationary_guesses(problem, 2 * count - 1, rng)
     else:
         notes = [] if notes is None else notes
-        routes, cache = BaseRoutes(problem), KeyframeCache()
-        shared = _Shared(problem, random_seed, notes, routes, cache, effort)
+        shared = _Shared(problem, random_seed, notes, BaseRoutes(problem), KeyframeCache(), effort)
         if method == "auto":
-            is_fixed = problem.chain.robot.base == "fixed"  # "astar" would equal "interpolated"
-            kinds = ("interpolated", "rrt") if is_fixed else ("interpolated", "astar", "rrt")
+            kinds = ["interpolated", "astar", "rrt"]
+            if problem.chain.robot.base == "fixed":
+                kinds.remove("astar")  # it would equal "interpolated"
             guesses = interleave_guesses(
-                *(_generate_guesses(kind, shared, count, is_infeasible) for kind in kinds)
+                *[_generate_guesses(kind, shared, count, is_infeasible) for kind in kinds]
             )
         else:
             found = _generate_guesses(method, shared, count, lambda _: False)
             guesses = (guess for guess in found if guess is not None)
     rng = np.random.default_rng([random_seed, 1])
     for guess in guesses:
-        yield (
-            replace(guess, z=perturb(problem, guess.z, perturbation, rng))
-            if perturbation
-            else guess
-        )
+        if perturbation:
+            guess = replace(guess, z=perturb(problem, guess.z, perturbation, rng))
+        yield guess
 
 
 def interleave_guesses(*kinds: _Kind) -> Iterator[InitialGuess]:
@@ -101,12 +99,14 @@ def interleave_guesses(*kinds: _Kind) -> Iterator[InitialGuess]:
     def is_good(guess: InitialGuess | None) -> bool:
         return guess is not None and not guess.penetration > MAX_GOOD_PENETRATION
 
-    def rank(one: tuple[_Kind, InitialGuess]) -> tuple[int, float]:
-        kind, guess = one
-        return 0 if is_good(guess) else 1 + turns[kind], guess.penetration
+    def rank(kind_and_guess: tuple[_Kind, InitialGuess]) -> tuple[int, float]:
+        kind, guess = kind_and_guess
+        return 0 if is_good(guess) else 1 + yield_counts[kind], guess.penetration
 
-    waiting, poor = list(kinds), set[_Kind]()
-    found, turns = list[tuple[_Kind, InitialGuess]](), Counter[_Kind]()
+    waiting = list(kinds)  # methods that may have further guesses
+    poor = set[_Kind]()  # methods whose last search found no good guess
+    found = list[tuple[_Kind, InitialGuess]]()  # guesses that were not yielded yet
+    yield_counts = Counter[_Kind]()
     while waiting or found:
         for kind in sorted(waiting, key=lambda kind: kind in poor):
             waiting.remove(kind)
@@ -115,17 +115,21 @@ def interleave_guesses(*kinds: _Kind) -> Iterator[InitialGuess]:
             except StopIteration:
                 continue
             waiting.append(kind)
-            (poor.discard if is_good(guess) else poor.add)(kind)
             if guess is not None:
                 found.append((kind, guess))
             if is_good(guess):
+                poor.discard(kind)
                 break
-        ready = [one for one in found if not waiting or not one[1].is_deep]
+            poor.add(kind)
+        ready = found
+        if waiting:
+            ready = [(kind, guess) for kind, guess in found if not guess.is_deep]
         if ready:
             best = min(ready, key=rank)
             found.remove(best)
-            turns[best[0]] += 1
-            yield best[1]
+            kind, guess = best
+            yield_counts[kind] += 1
+            yield guess
 
 
 def _generate_stationary_guesses(
@@ -136,19 +140,24 @@ def _generate_stationary_guesses(
     The base moves to a random place, near or far, in each phase; an arm on a fixed base, to a
     random posture. Lengths are sampled within limits, angles within π of the start.
     """
-    still, robot = interpolate_object_joints(problem, problem.still), problem.chain.robot
+    still = interpolate_object_joints(problem, problem.still)
     yield InitialGuess("stationary", still)
+    robot = problem.chain.robot
     columns = np.arange(3, robot.coordinates.size) if robot.base == "fixed" else np.arange(3)
-    turns = np.array([problem.unit(problem.chain.names[column]) == "rad" for column in columns])
+    units = [problem.unit(problem.chain.names[column]) for column in columns]
+    is_angle = np.array([unit == "rad" for unit in units])
     middle = problem.start[columns]
     for number in range(2, count + 1):
         z = still.copy()
         for begin, end in itertools.pairwise([0, *problem.ends.tolist()]):
             now = problem.waypoints(z)[begin, columns]
-            share = np.minimum(np.arange(1, len(z) - begin + 1) / (end - begin), 1.0)[:, None]
-            low = np.where(turns, middle - np.pi, problem.lower[end - 1, columns])
-            high = np.where(turns, middle + np.pi, problem.upper[end - 1, columns])
-            z[begin:, columns] = now + share * rng.uniform() * (rng.uniform(low, high) - now)
+            s = np.minimum(np.arange(1, len(z) - begin + 1) / (end - begin), 1.0)[:, None]
+            low = np.where(is_angle, middle - np.pi, problem.lower[end - 1, columns])
+            high = np.where(is_angle, middle + np.pi, problem.upper[end - 1, columns])
+            # Part of the displacement to a random place: near places are as likely as far ones.
+            fraction = rng.uniform()
+            displacement = rng.uniform(low, high) - now
+            z[begin:, columns] = now + s * fraction * displacement
         yield InitialGuess(f"stationary {number}", problem.clip(z))
 
 
@@ -165,9 +174,11 @@ class _Shared:
 
     @property
     def driving_routes(self) -> BaseRoutes | None:
+        """Base paths, unless the base is fixed."""
         return self.routes if self.problem.chain.robot.base != "fixed" else None
 
     def make_sampler(self) -> KeyframeSampler:
+        """Return a sampler that starts with the random seed, and shares results."""
         return KeyframeSampler(self.problem, np.random.default_rng(self.random_seed), self.cache)
 
 
@@ -178,11 +189,10 @@ def _generate_guesses(
     if method != "rrt":
         yield from _GuessSearch(shared, method).generate(count)
         return
-    blocked = [
-        number
-        for number, end in enumerate(shared.problem.ends.tolist())
-        if not shared.make_sampler().has_free_keyframe(end)
-    ]
+    blocked = []
+    for number, end in enumerate(shared.problem.ends.tolist()):
+        if not shared.make_sampler().has_free_keyframe(end):
+            blocked.append(number)
     if not is_infeasible(blocked):
         yield from _RrtSearch(shared, method).generate(count)
 
@@ -191,10 +201,13 @@ class _GuessSearch:
     """Generates guesses along the cheapest keyframe paths: straight, or with A* for the base."""
 
     def __init__(self, shared: _Shared, method: str) -> None:
-        self.problem, self.notes, self.method = shared.problem, shared.notes, method
+        self.problem = shared.problem
+        self.notes = shared.notes
+        self.method = method
         self.beam, self.interpolator = self._make_parts(shared)
 
     def _make_parts(self, shared: _Shared) -> tuple[BeamSearch, Interpolator]:
+        """Return the search of keyframes, and the interpolation between them."""
         sampler = shared.make_sampler()
         routes = shared.driving_routes if self.method == "astar" else None
         paths = make_base_paths(sampler, routes)
@@ -220,18 +233,23 @@ class _GuessSearch:
                 return
 
     def _search(self, attempt: int) -> SearchResult | None:
-        found = self._run_beam_search(thorough=attempt > 0, backwards=self.beam.has_dead_ends)
-        return found if attempt > 0 or self.beam.is_acceptable(found) else None
+        """Run a search; None if it was quick and its result is not acceptable."""
+        is_thorough = attempt > 0
+        found = self._run_beam_search(thorough=is_thorough, backwards=self.beam.has_dead_ends)
+        if is_thorough or self.beam.is_acceptable(found):
+            return found
+        return None
 
     def _run_beam_search(self, **how: bool) -> SearchResult:
         """Run the beam search; if it fails for a steered base, again with diverse headings."""
         found = self.beam.search(**how)
         if self.problem.rolling.turning_radius > 0.0 and not self.beam.is_acceptable(found):
             other = self.beam.search(**how, keep_headings=True)
-            found = min(found, other, key=lambda one: float(one.cost.min()))
+            found = min(found, other, key=lambda result: float(result.cost.min()))
         return found
 
     def _interpolate(self, path: Floats, found: SearchResult) -> Floats | None:
+        """Interpolate along a path of keyframes."""
         return self.interpolator.interpolate(path, found.waypoints)
 
     def _is_same(self, path: Floats, other: Floats) -> bool:
@@ -253,8 +271,11 @@ class _GuessSearch:
 
         The first sufficient guess ends the comparison. Returns path, guess and penetration [m].
         """
-        problem, options = self.problem, self.problem.options
-        best, least, compared = None, np.inf, list[Floats]()
+        problem = self.problem
+        options = problem.options
+        best = None
+        least_merit = np.inf
+        compared = list[Floats]()
         for path in self._order_paths(found):
             if len(compared) == _COMPARED_PATHS:
                 break
@@ -270,8 +291,9 @@ class _GuessSearch:
             penetration = float(max(shortfall.max() - options.dist_safe, 0.0))
             total = float(shortfall.sum())
             merit = problem.objective(z, problem.timing_for(z).dt) + options.penalty * total
-            if merit < least:
-                best, least = (path, z, penetration), merit
+            if merit < least_merit:
+                best = (path, z, penetration)
+                least_merit = merit
             if self._is_sufficient(z, total, penetration):
                 break
         return best

@@ -28,12 +28,14 @@ from vkc_pin.planning.initialization.keyframes import (
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 
 _PIECE = 0.5  # longest edge of a tree, in the metric of searches: [rad] of a joint
-_CHECK_STEP, _FINE_STEP = 0.05, 0.01  # between collision checks while trees grow, and of the result
+_CHECK_STEP = 0.05  # between collision checks while trees grow
+_FINE_STEP = 0.01  # between those of the result
 _SAMPLES = 32  # towards which a tree grows at once
 # largest standard deviation of guided samples from guide path and likely postures
-_BASE_SPREAD, _ARM_SPREAD = 0.1, 0.4  # [m] and [rad]
+_BASE_SPREAD = 0.1  # [m] and [rad]
+_ARM_SPREAD = 0.4  # [m] and [rad]
 _SHORTCUTS = 20  # lines between random points of a path, tried at once
-# Shortcuts end with a round that saves less than this share of the length; with 3 %, motions are
+# Shortcuts end with a round that saves less than this fraction of the length; with 3 %, motions are
 # 4 % longer
 _ROUND_SAVING = 0.01
 _STRAIGHTENING_ROUNDS = 3
@@ -41,7 +43,8 @@ _PRODUCT_SIZE = 200_000  # multiplications in a product of matrices that needs n
 _FAR = 1e6  # scaled coordinates of nodes that are cut off
 # An arm on a fixed base searches further paths, until this multiple of the checks of the first one
 # or this number of paths; the shortest is used
-_EFFORT, _PATHS = 2, 5
+_CHECKS_FACTOR = 2
+_PATHS = 5
 _MIN_DETOUR = 1e-6  # [rad] by which a corner is further from its neighbours than on a line
 _MIN_SAVING = 1e-3  # relative saving in length that a shortcut needs
 
@@ -65,7 +68,8 @@ class _Tree:
     """
 
     def __init__(self, roots: Floats, weights: Floats) -> None:
-        self.z, self.parents = roots, np.full(len(roots), -1)
+        self.z = roots
+        self.parents = np.full(len(roots), -1)
         self.weights = weights
         self.scaled = weights * roots
 
@@ -102,10 +106,12 @@ class _Tree:
         # |a − b|² = |a|² − 2 a·b + |b|²; the last part is the same for all nodes. BLAS computes
         # large products in threads, which cost more than they save here.
         squares = np.einsum("ij,ij->i", self.scaled, self.scaled)
-        parts = np.array_split(scaled, 1 + scaled.size * len(self.z) // _PRODUCT_SIZE)
-        nearest = np.concatenate(
-            [(squares - 2.0 * part @ self.scaled.T).argmin(axis=1) for part in parts]
-        )
+        part_count = 1 + scaled.size * len(self.z) // _PRODUCT_SIZE
+        nearest_of_parts = []
+        for part in np.array_split(scaled, part_count):
+            differences = squares - 2.0 * part @ self.scaled.T
+            nearest_of_parts.append(differences.argmin(axis=1))
+        nearest = np.concatenate(nearest_of_parts)
         return nearest, np.linalg.norm(self.scaled[nearest] - scaled, axis=1)
 
 
@@ -133,9 +139,13 @@ class OpenSearch:
         *,
         allowed: float,
     ) -> None:
-        self.problem, self.rng, self.guide, self.phase = sampler.problem, sampler.rng, guide, phase
+        self.problem = sampler.problem
+        self.rng = sampler.rng
+        self.guide = guide
+        self.phase = phase
         self.waypoint = self.problem.contacts.find_waypoint(phase)
-        self.first, self.size = first, sampler.robot_size
+        self.first = first
+        self.size = sampler.robot_size
         self.weights = sampler.weights[: self.size]
         self.checks = 0
         names = self.problem.chain.names[: self.size]
@@ -143,20 +153,23 @@ class OpenSearch:
         self.lower, self.upper = limits.T
         # Joints that can turn more than once are sampled within half a turn of the middle.
         middle = (first + ends[0])[: self.size] / 2.0
-        turns = np.array([self.problem.unit(name) == "rad" for name in names])
-        is_endless = turns & (self.upper - self.lower > 2.0 * np.pi)
+        is_angle = np.array([self.problem.unit(name) == "rad" for name in names])
+        is_endless = is_angle & (self.upper - self.lower > 2.0 * np.pi)
         self.lowest = np.where(is_endless, np.maximum(self.lower, middle - np.pi), self.lower)
         self.highest = np.where(is_endless, np.minimum(self.upper, middle + np.pi), self.upper)
-        self.start, self.ends = first[None, : self.size], ends[:, : self.size]
+        self.start = first[None, : self.size]
+        self.ends = ends[:, : self.size]
         # A search cannot keep more clearance than its ends, but these may not be deep in collision.
-        starting, ending = self._compute_shortfall(self.start), self._compute_shortfall(self.ends)
-        needed = max(float(starting[0]), float(ending.min()))
+        (start_shortfall,) = self._compute_shortfall(self.start)
+        end_shortfalls = self._compute_shortfall(self.ends)
+        needed = max(float(start_shortfall), float(end_shortfalls.min()))
         self.allowed = max(allowed, min(needed, 2.0 * self.problem.options.dist_safe))
-        self.ends = self.ends[ending <= self.allowed]
+        self.ends = self.ends[end_shortfalls <= self.allowed]
         self.has_ends = needed <= self.allowed
         self._reset_trees()
 
     def _compute_shortfall(self, z: Floats) -> Floats:
+        """Return the clearance that configurations lack, shape (B,) [m]."""
         return compute_shortfall(self.problem, self._complete(z), self.waypoint)
 
     def find_path(self, steps: int, max_checks: int) -> Floats | None:
@@ -168,20 +181,25 @@ class OpenSearch:
             steps: Number of waypoints.
             max_checks: Number of collision checks after which the search ends.
         """
-        first = self._connect(max_checks) if self.has_ends else None
+        if not self.has_ends:
+            return None
+        first = self._connect(max_checks)
         if first is None:
             return None
-        paths, limit = [first], _EFFORT * self.checks
+        paths = [first]
+        limit = _CHECKS_FACTOR * self.checks
         while self.guide is None and len(paths) < _PATHS and self.checks < limit:
             self._reset_trees()
             other = self._connect(limit)
             if other is not None:
                 paths.append(other)
         shorter = [self._cut_corners(path, _CHECK_STEP) for path in paths]
-        best = int(np.argmin([self._measure_along(path)[-1] for path in shorter]))
+        lengths = [self._measure_along(path)[-1] for path in shorter]
+        best = int(np.argmin(lengths))
         path = self._straighten(shorter[best], _CHECK_STEP)
         if not self._are_lines_free(path[:-1], path[1:], _FINE_STEP).all():
-            path = self._straighten(self._cut_corners(paths[best], _FINE_STEP), _FINE_STEP)
+            shorter_path = self._cut_corners(paths[best], _FINE_STEP)
+            path = self._straighten(shorter_path, _FINE_STEP)
         return self._resample(path, steps)
 
     def find_obstruction(self) -> tuple[str, str] | None:
@@ -191,32 +209,36 @@ class OpenSearch:
         """
         if not self.has_ends:
             return None
-        one, other = self.trees
-        goals = other.z[np.isfinite(other.z).all(axis=1)]
-        nearest, gaps = one.find_nearest(goals)
+        tree_of_start, tree_of_ends = self.trees
+        goals = tree_of_ends.z[np.isfinite(tree_of_ends.z).all(axis=1)]
+        nearest, gaps = tree_of_start.find_nearest(goals)
         k = int(gaps.argmin())
-        start, end = one.z[nearest[k]], goals[k]
+        start = tree_of_start.z[nearest[k]]
+        end = goals[k]
         count = max(int(np.ceil(gaps[k] / _FINE_STEP)), 1)
-        line = self._complete(start + np.arange(1, count + 1)[:, None] / count * (end - start))
+        s = np.arange(1, count + 1)[:, None] / count
         contacts = self.problem.contacts.evaluate(
-            line,
+            self._complete(start + s * (end - start)),
             np.full(count, self.waypoint),
             reach=self.problem.options.largest_margin,
             nearest=1,
         )
-        wrong = np.flatnonzero(contacts.margin - contacts.distance > self.allowed)
-        if not len(wrong):
+        colliding = np.flatnonzero(contacts.margin - contacts.distance > self.allowed)
+        if not len(colliding):
             return None
         labels = self.problem.contacts.phases[self.phase].labels
-        first, second = contacts.pair[wrong[0]]
+        first, second = contacts.pair[colliding[0]]
         return labels[first], labels[second]
 
     def _reset_trees(self) -> None:
-        self.trees = _Tree(self.start, self.weights), _Tree(self.ends, self.weights)
+        """Start again with one tree at the start, and one at all ends."""
+        self.trees = (_Tree(self.start, self.weights), _Tree(self.ends, self.weights))
 
     def _connect(self, max_checks: int) -> Floats | None:
         """Find a path from the start to one of the ends, shape (P, m); None if there is none."""
-        trees, tips, grown = self.trees, np.arange(len(self.ends)), 1
+        trees = self.trees
+        grown = 1  # number of the tree that has grown
+        tips = np.arange(len(self.ends))  # its new nodes
         while True:
             path = self._try_connect(trees[grown], trees[1 - grown], tips)
             if path is not None:
@@ -224,23 +246,25 @@ class OpenSearch:
             if self.checks >= max_checks:
                 return None
             grown = 0 if len(trees[0]) <= len(trees[1]) else 1
-            before = len(trees[grown])
-            tips = np.unique(self._grow(trees[grown], self._sample())[0])
-            tips = tips[tips >= before]
+            size_before = len(trees[grown])
+            last_nodes, _ = self._grow(trees[grown], self._sample())
+            tips = np.unique(last_nodes)
+            tips = tips[tips >= size_before]
 
     def _sample(self) -> Floats:
         """Sample configurations, shape (_SAMPLES, m): with a guide, half of them near it."""
         z = self.rng.uniform(self.lowest, self.highest, (_SAMPLES, self.size))
         if self.guide is None:
             return z
-        half, quarter = _SAMPLES // 2, _SAMPLES // 4
-        near = z[:half]
-        near[:, :3] = self.rng.choice(self.guide.poses, half)
-        near[:, 3:] = self.rng.choice(self.guide.arms, half)
+        half = _SAMPLES // 2
+        quarter = _SAMPLES // 4
+        near_guide = z[:half]
+        near_guide[:, :3] = self.rng.choice(self.guide.poses, half)
+        near_guide[:, 3:] = self.rng.choice(self.guide.arms, half)
         # Half of these are exactly on the guide path, in one of the likely postures.
         spread = self.rng.uniform(0.0, 1.0, (half, 1)) * self.rng.integers(2, size=(half, 1))
         deviation = np.repeat([_BASE_SPREAD, _ARM_SPREAD], [3, self.size - 3])
-        near += spread * deviation * self.rng.normal(size=near.shape)
+        near_guide += spread * deviation * self.rng.normal(size=near_guide.shape)
         # A quarter of all have any posture on the guide path.
         z[half : half + quarter, :3] = self.rng.choice(self.guide.poses, quarter)
         return np.clip(z, self.lower, self.upper)
@@ -253,11 +277,13 @@ class OpenSearch:
         """
         nearest, gaps = tree.find_nearest(goals)
         pieces = np.maximum(np.ceil(gaps / _PIECE).astype(int), 1)
-        starts, tips = tree.z[nearest], nearest.copy()
+        starts = tree.z[nearest]
         free = self._count_free_pieces(starts, goals, pieces)
+        tips = nearest.copy()
         for k in np.flatnonzero((free > 0) & (gaps > 0.0)):
-            share = np.arange(1, free[k] + 1)[:, None] / pieces[k]
-            tips[k] = tree.add_branch(int(nearest[k]), starts[k] + share * (goals[k] - starts[k]))
+            s = np.arange(1, free[k] + 1)[:, None] / pieces[k]
+            branch = starts[k] + s * (goals[k] - starts[k])
+            tips[k] = tree.add_branch(int(nearest[k]), branch)
         return tips, free == pieces
 
     def _try_connect(self, tree: _Tree, other: _Tree, tips: Ints) -> Floats | None:
@@ -289,8 +315,9 @@ class OpenSearch:
                 is_whole = is_whole and bool(free.all())
         if not is_whole:
             return None
-        here, there = tree.list_ancestors(tip), other.list_ancestors(end)
-        return np.vstack([tree.z[here[::-1]], other.z[there[1:]]])
+        to_tip = tree.list_ancestors(tip)[::-1]
+        from_end = other.list_ancestors(end)[1:]
+        return np.vstack([tree.z[to_tip], other.z[from_end]])
 
     def _measure(self, z: Floats, other: Floats) -> Floats:
         """Return distances between configurations in the metric of searches."""
@@ -302,20 +329,21 @@ class OpenSearch:
         whole[:, : self.size] = z
         return whole
 
-    def _count_free(self, starts: Floats, ends: Floats, shares: Sequence[Floats]) -> Ints:
+    def _count_free(self, starts: Floats, ends: Floats, fractions: Sequence[Floats]) -> Ints:
         """Return how many configurations of straight lines precede the first collision, shape (B,).
 
         Args:
             starts: Starts of the lines, shape (B, m).
             ends: Their ends, shape (B, m).
-            shares: For each line, the shares of its length at which it is checked, in this order.
+            fractions: For each line, the fractions of its length at which it is checked, in order.
         """
-        if not shares:
+        if not fractions:
             return np.zeros(0, int)
-        counts = [len(each) for each in shares]
+        counts = [len(of_line) for of_line in fractions]
         lines = np.repeat(np.arange(len(counts)), counts)
         edges = np.cumsum([0, *counts])
-        z = starts[lines] + np.concatenate(shares)[:, None] * (ends - starts)[lines]
+        s = np.concatenate(fractions)[:, None]
+        z = starts[lines] + s * (ends - starts)[lines]
         reach = self.problem.options.largest_margin
         free = self.problem.contacts.count_free(
             self._complete(z), edges, self.waypoint, reach=reach, allowed=self.allowed
@@ -329,8 +357,8 @@ class OpenSearch:
         Configurations far apart are checked first, since they are most likely to differ.
         """
         counts = np.maximum(np.ceil(self._measure(starts, ends) / step).astype(int), 1)
-        shares = [_order_shares(count) for count in counts.tolist()]
-        return np.asarray(self._count_free(starts, ends, shares) == counts)
+        fractions = [_order_fractions(count) for count in counts.tolist()]
+        return np.asarray(self._count_free(starts, ends, fractions) == counts)
 
     def _count_free_pieces(self, starts: Floats, ends: Floats, pieces: Ints) -> Ints:
         """Return how many pieces of straight lines are free, from their starts on, shape (B,).
@@ -339,12 +367,12 @@ class OpenSearch:
         """
         lengths = self._measure(starts, ends) / pieces
         steps = np.maximum(np.ceil(lengths / _CHECK_STEP).astype(int), 1)
-        shares = [np.arange(1, count + 1) / count for count in (pieces * steps).tolist()]
-        first = [share[:step] for share, step in zip(shares, steps, strict=True)]
-        free = self._count_free(starts, ends, first)
+        fractions = [np.arange(1, count + 1) / count for count in (pieces * steps).tolist()]
+        first_pieces = [of_line[:step] for of_line, step in zip(fractions, steps, strict=True)]
+        free = self._count_free(starts, ends, first_pieces)
         longer = np.flatnonzero((free == steps) & (pieces > 1))
-        rest = [shares[k][steps[k] :] for k in longer]
-        free[longer] += self._count_free(starts[longer], ends[longer], rest)
+        other_pieces = [fractions[k][steps[k] :] for k in longer]
+        free[longer] += self._count_free(starts[longer], ends[longer], other_pieces)
         return np.asarray(free // steps)
 
     def _cut_corners(self, path: Floats, step: float) -> Floats:
@@ -360,15 +388,15 @@ class OpenSearch:
             ends = _interpolate(at.ravel(), passed, path).reshape(_SHORTCUTS, 2, -1)
             savings = at[:, 1] - at[:, 0] - self._measure(ends[:, 0], ends[:, 1])
             useful = np.flatnonzero(savings > _MIN_SAVING * passed[-1])
-            free = self._are_lines_free(ends[useful, 0], ends[useful, 1], step)
-            used = list[int]()
-            for k in sorted(useful[free].tolist(), key=lambda k: -savings[k]):
-                if all(at[k, 0] > at[j, 1] or at[k, 1] < at[j, 0] for j in used):
-                    used.append(k)
-            for k in used:  # `passed` stays the length along the path before
-                before, after = passed < at[k, 0], passed > at[k, 1]
-                path = np.vstack([path[before], ends[k], path[after]])
-                passed = np.concatenate([passed[before], at[k], passed[after]])
+            is_free = self._are_lines_free(ends[useful, 0], ends[useful, 1], step)
+            free = useful[is_free]
+            by_saving = free[np.argsort(-savings[free], kind="stable")]
+            for k in _select_disjoint(at, by_saving.tolist()):
+                # `passed` stays the length along the path before.
+                is_before = passed < at[k, 0]
+                is_after = passed > at[k, 1]
+                path = np.vstack([path[is_before], ends[k], path[is_after]])
+                passed = np.concatenate([passed[is_before], at[k], passed[is_after]])
             passed = self._measure_along(path)
         return path
 
@@ -379,12 +407,14 @@ class OpenSearch:
         coordinates seldom undo that, and the solver cannot, because obstacles are in between
         (partial shortcuts: Geraerts and Overmars, IJRR 2007).
         """
-        arm = range(3, self.size)
+        arm = [*range(3, self.size)]
+        single_joints = [[column] for column in arm]
         for number in range(1 + _STRAIGHTENING_ROUNDS):
-            for columns in (arm, *([column] for column in arm)):
+            for columns in [arm, *single_joints]:
                 passed = self._measure_along(path)
-                first, last = 0.0, float(passed[-1])
-                if number:
+                first = 0.0
+                last = float(passed[-1])
+                if number > 0:  # the first round is along the whole path
                     first, last = np.sort(self.rng.uniform(0.0, passed[-1], 2))
                 path = self._replace(path, passed, first, last, columns, step)
         return path
@@ -418,10 +448,11 @@ class OpenSearch:
         at = np.array([first, *passed[inside], last])
         old = _interpolate(at, passed, path)
         new = old.copy()
-        share = ((at - first) / (last - first))[:, None]
-        new[:, columns] = (old[0] + share * (old[-1] - old[0]))[:, columns]
-        before, after = (self._measure(part[1:], part[:-1]).sum() for part in (old, new))
-        is_shorter = after < (1.0 - _MIN_SAVING) * before
+        s = ((at - first) / (last - first))[:, None]
+        new[:, columns] = (old[0] + s * (old[-1] - old[0]))[:, columns]
+        old_length = self._measure(old[1:], old[:-1]).sum()
+        new_length = self._measure(new[1:], new[:-1]).sum()
+        is_shorter = new_length < (1.0 - _MIN_SAVING) * old_length
         if not is_shorter or not self._are_lines_free(new[:-1], new[1:], step).all():
             return path
         return np.vstack([path[passed < first], new, path[passed > last]])
@@ -433,7 +464,8 @@ class OpenSearch:
         """
         passed = self._measure_along(path)
         at = passed[-1] * sample_smoothstep(steps)
-        detours = np.diff(passed)[1:] + np.diff(passed)[:-1] - self._measure(path[2:], path[:-2])
+        lengths = np.diff(passed)
+        detours = lengths[1:] + lengths[:-1] - self._measure(path[2:], path[:-2])
         for corner in passed[1:-1][detours > _MIN_DETOUR]:
             at[int(np.argmin(np.abs(at[:-1] - corner)))] = corner
         return self._complete(_interpolate(at, passed, path))
@@ -444,11 +476,25 @@ def _interpolate(at: Floats, passed: Floats, path: Floats) -> Floats:
     return np.stack([np.interp(at, passed, column) for column in path.T], axis=1)
 
 
+def _select_disjoint(spans: Floats, numbers: Sequence[int]) -> list[int]:
+    """Return the numbers of spans, (K, 2), that overlap none that were selected before."""
+    selected = list[int]()
+    for k in numbers:
+        if all(spans[k, 0] > spans[j, 1] or spans[k, 1] < spans[j, 0] for j in selected):
+            selected.append(k)
+    return selected
+
+
 @functools.cache
-def _order_shares(count: int) -> Floats:
+def _order_fractions(count: int) -> Floats:
     """Return 1/count, 2/count, ..., 1 in an order of bisection: 1, then about 1/2, 1/4, 3/4."""
-    stride, order = count, {count: None}
+    stride = count
+    order = [count]
+    known = {count}
     while len(order) < count:
         stride = max(1, stride // 2)
-        order |= dict.fromkeys(range(stride, count, stride))
-    return np.array(list(order)) / count
+        for number in range(stride, count, stride):
+            if number not in known:
+                known.add(number)
+                order.append(number)
+    return np.array(order) / count

@@ -30,6 +30,7 @@ __all__ = [
     "rnea",
 ]
 
+_ROTATION_ROUNDING = 4e-16  # of the entries of a rotation matrix
 # values of pinocchio.ReferenceFrame
 _REFERENCE_FRAMES = {"world": 0, "local": 1, "local_world_aligned": 2}
 
@@ -83,9 +84,9 @@ def frame_placements(model: pin.Model, frames: Sequence[str | int]) -> casadi.Fu
         UnknownNameError: The model has no such frame.
         InputError: Several different frames of the model have this name.
     """
-    listed: tuple[Any, ...] = check_list(
-        [frames] if isinstance(frames, str) else frames, "frames", "a list of frames"
-    )
+    if isinstance(frames, str):
+        frames = [frames]
+    listed: tuple[Any, ...] = check_list(frames, "frames", "a list of frames")
     indices = [_find_frame(model, frame, f"frames[{i}]") for i, frame in enumerate(listed)]
     return _get_backend()("frame_placements", _round_quarter_turns(model), indices)
 
@@ -158,7 +159,8 @@ def _find_frame(model: pin.Model, frame: str | int, field: str) -> int:
     first = model.frames[found[0]]
     # In a URDF a joint and a link may have frames of the same name. As long as they coincide,
     # either one will do.
-    for other in (model.frames[index] for index in found[1:]):
+    for index in found[1:]:
+        other = model.frames[index]
         if other.parentJoint != first.parentJoint or other.placement != first.placement:
             raise InputError(
                 f"several frames are named '{frame}'", field=field, expected="an index", got=found
@@ -175,7 +177,10 @@ def _round_quarter_turns(model: pin.Model) -> pin.Model:
     import pinocchio as pin
 
     copy = check_instance(model, pin.Model, "model").copy()
-    for placement in [*copy.jointPlacements, *(frame.placement for frame in copy.frames)]:
-        rotation, nearest = placement.rotation, np.round(placement.rotation)
-        placement.rotation = np.where(np.abs(rotation - nearest) <= 4e-16, nearest, rotation)
+    placements_of_frames = [frame.placement for frame in copy.frames]
+    for placement in [*copy.jointPlacements, *placements_of_frames]:
+        rotation = placement.rotation
+        nearest = np.round(rotation)
+        is_rounding = np.abs(rotation - nearest) <= _ROTATION_ROUNDING
+        placement.rotation = np.where(is_rounding, nearest, rotation)
     return copy

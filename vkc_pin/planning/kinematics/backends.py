@@ -23,9 +23,8 @@ def build_compiled(name: str, model: pin.Model, *arguments: Any) -> casadi.Funct
         model: The model.
         arguments: Its further arguments; frames and references as numbers.
     """
-    return casadi.Function.deserialize(
-        getattr(_import_extension(), name)(model.saveToString(), *arguments)
-    )
+    build = getattr(_import_extension(), name)
+    return casadi.Function.deserialize(build(model.saveToString(), *arguments))
 
 
 def check_versions(built: dict[str, str], installed: dict[str, str]) -> None:
@@ -38,19 +37,18 @@ def check_versions(built: dict[str, str], installed: dict[str, str]) -> None:
     Raises:
         BuildError: A release differs; the message says which, and what to install.
     """
-    mismatched = [
-        name for name in built if _parse_release(built[name]) != _parse_release(installed[name])
-    ]
-    if mismatched:
-        mismatches = " and ".join(
-            f"{name} {built[name]}, but {installed[name]} is installed" for name in mismatched
-        )
-        requirements = " ".join(
-            f"'{name}=={'.'.join(map(str, _parse_release(built[name])))}.*'" for name in mismatched
-        )
+    mismatches = []
+    requirements = []
+    for name, version in built.items():
+        major, minor = _parse_release(version)
+        if (major, minor) == _parse_release(installed[name]):
+            continue
+        mismatches.append(f"{name} {version}, but {installed[name]} is installed")
+        requirements.append(f"'{name}=={major}.{minor}.*'")
+    if mismatches:
         raise BuildError(
-            f"vkc_pin.planning.kinematics was compiled against {mismatches}. "
-            f"Either pip install {requirements}, or {REBUILD_HINT}"
+            f"vkc_pin.planning.kinematics was compiled against {' and '.join(mismatches)}. "
+            f"Either pip install {' '.join(requirements)}, or {REBUILD_HINT}"
         )
 
 
@@ -80,19 +78,25 @@ def _import_extension() -> Any:
 def build_upstream(name: str, model: pin.Model, *arguments: Any) -> casadi.Function:
     """Return the named function, built by `pinocchio.casadi`; see `build_compiled`."""
     cpin = import_module("pinocchio.casadi")
-    symbolic, inputs = cpin.Model(model), {"q": casadi.SX.sym("q", model.nq, 1)}
-    data, q = symbolic.createData(), inputs["q"]
+    symbolic = cpin.Model(model)
+    data = symbolic.createData()
+    q = casadi.SX.sym("q", model.nq, 1)
+    inputs = {"q": q}
     if name == "rnea":
-        inputs |= {part: casadi.SX.sym(part, model.nv, 1) for part in ("v", "a")}
-        output, result = cpin.rnea(symbolic, data, *inputs.values()), "tau"
+        inputs["v"] = casadi.SX.sym("v", model.nv, 1)
+        inputs["a"] = casadi.SX.sym("a", model.nv, 1)
+        output = cpin.rnea(symbolic, data, q, inputs["v"], inputs["a"])
+        output_name = "tau"
     elif name == "center_of_mass":
-        output, result = cpin.centerOfMass(symbolic, data, q), "com"
+        output = cpin.centerOfMass(symbolic, data, q)
+        output_name = "com"
     elif name == "frame_jacobian":
         frame, reference = arguments
         cpin.computeJointJacobians(symbolic, data, q)
         cpin.updateFramePlacements(symbolic, data)
         axes = pin.ReferenceFrame.values[reference]
-        output, result = cpin.getFrameJacobian(symbolic, data, frame, axes), "J"
+        output = cpin.getFrameJacobian(symbolic, data, frame, axes)
+        output_name = "J"
     else:
         cpin.forwardKinematics(symbolic, data, q)
         cpin.updateFramePlacements(symbolic, data)
@@ -100,10 +104,11 @@ def build_upstream(name: str, model: pin.Model, *arguments: Any) -> casadi.Funct
             placements = [data.oMi[i] for i in range(1, model.njoints)]
         else:
             placements = [data.oMf[i] for i in arguments[0]]
-        columns = [
-            casadi.vertcat(casadi.vec(casadi.SX(m.rotation)), casadi.SX(m.translation))
-            for m in placements
-        ]
-        output, result = casadi.horzcat(casadi.SX(12, 0), *columns), "M"
+        output = casadi.SX(12, 0)
+        for placement in placements:
+            rotation = casadi.vec(casadi.SX(placement.rotation))
+            column = casadi.vertcat(rotation, casadi.SX(placement.translation))
+            output = casadi.horzcat(output, column)
+        output_name = "M"
     simplified = casadi.cse(casadi.sparsify(casadi.SX(output)))
-    return casadi.Function(name, list(inputs.values()), [simplified], list(inputs), [result])
+    return casadi.Function(name, list(inputs.values()), [simplified], list(inputs), [output_name])

@@ -28,8 +28,9 @@ class BatchFunction:
     def __init__(self, function: ca.Function) -> None:
         self.function = function
         self._buffers: OrderedDict[int, tuple[Any, Any, list[Floats], list[Floats]]] = OrderedDict()
-        self._code, self._executed_instructions = MachineCode(function), 0
+        self._code = MachineCode(function)
         self._instructions = function.n_instructions()
+        self._executed_instructions = 0  # since machine code was last requested
 
     def __call__(self, *inputs: Floats) -> list[Floats]:
         """Return one array per output, shape (B, numel), each row in column-major order.
@@ -45,7 +46,8 @@ class BatchFunction:
             self._executed_instructions = 0
             if self._code.try_load():
                 self._buffers.clear()
-        batch_size = max(-(-rows // _BATCH_MULTIPLE), 1) * _BATCH_MULTIPLE
+        multiples = max(-(-rows // _BATCH_MULTIPLE), 1)  # rounded up
+        batch_size = multiples * _BATCH_MULTIPLE
         if batch_size not in self._buffers:
             self._allocate(batch_size)
         self._buffers.move_to_end(batch_size)
@@ -56,14 +58,19 @@ class BatchFunction:
         return [result[:rows].copy() for result in results]
 
     def _allocate(self, batch_size: int) -> None:
-        buffer, trigger = self._code.functions[0].map(batch_size).buffer()
-        f = self.function
-        arguments = [np.zeros((batch_size, f.nnz_in(i))) for i in range(f.n_in())]
-        results = [np.zeros((batch_size, f.nnz_out(i))) for i in range(f.n_out())]
-        for index, argument in enumerate(arguments):
+        """Allocate arrays that CasADi reads and writes, for one batch size."""
+        (function,) = self._code.functions
+        buffer, trigger = function.map(batch_size).buffer()
+        arguments = []
+        for index in range(self.function.n_in()):
+            argument = np.zeros((batch_size, self.function.nnz_in(index)))
             buffer.set_arg(index, argument.data)
-        for index, result in enumerate(results):
+            arguments.append(argument)
+        results = []
+        for index in range(self.function.n_out()):
+            result = np.zeros((batch_size, self.function.nnz_out(index)))
             buffer.set_res(index, result.data)
+            results.append(result)
         self._buffers[batch_size] = (buffer, trigger, arguments, results)
         while len(self._buffers) > _MAX_BUFFERS:
             self._buffers.popitem(last=False)
@@ -71,12 +78,10 @@ class BatchFunction:
     @property
     def nbytes(self) -> int:
         """Estimated size in memory [bytes]."""
-        buffers = (
-            array.nbytes
-            for *_, inputs, outputs in self._buffers.values()
-            for array in (*inputs, *outputs)
-        )
-        return estimate_size(self.function) + sum(buffers)
+        size = estimate_size(self.function)
+        for _, _, arguments, results in self._buffers.values():
+            size += sum(array.nbytes for array in (*arguments, *results))
+        return size
 
 
 def estimate_size(*functions: ca.Function) -> int:

@@ -40,7 +40,8 @@ BUILD = ".build-"
 """Start of the names of folders in which libraries are compiled."""
 
 # maximum number and size of libraries and records; a waypoint's functions take 0.1 MB
-_MAX_FILES, _MAX_BYTES = 256, 512 * 2**20
+_MAX_FILES = 256
+_MAX_BYTES = 512 * 2**20
 _MAX_JOBS = 64  # maximum number of pending jobs
 # [s] after which a failed compilation is retried and the files of dead processes are removed
 _RETRY_DELAY = 86400.0
@@ -123,16 +124,22 @@ class Libraries:
         """Request the compilation of a library; return whether it is pending now."""
         if self.has_failed(key):
             return False
-        if key not in (pending := self.list_jobs()):
-            if len(pending) >= _MAX_JOBS:
-                return False
-            self._write(f"{key}.job", job)
+        pending = self.list_jobs()
+        if key in pending:
+            return True
+        if len(pending) >= _MAX_JOBS:
+            return False
+        self._write(f"{key}.job", job)
         return True
 
     def list_jobs(self) -> list[str]:
         """Return the keys of pending jobs."""
-        found = (path for path in self.path.glob("*.job") if _FILE_PATTERN.fullmatch(path.name))
-        return sorted(path.stem for path in found if path.is_file() and not path.is_symlink())
+        keys = []
+        for path in self.path.glob("*.job"):
+            is_own = _FILE_PATTERN.fullmatch(path.name)
+            if is_own and path.is_file() and not path.is_symlink():
+                keys.append(path.stem)
+        return sorted(keys)
 
     def read_job(self, key: str) -> bytes:
         """Return the contents of a pending job."""
@@ -167,19 +174,19 @@ class Libraries:
 
         Only regular files and build folders with names that the package creates are removed.
         """
-        libraries, now = [], time.time()
+        libraries = []
+        now = time.time()
         for path in self.path.iterdir():
             with contextlib.suppress(OSError):
                 status = path.lstat()
                 is_old = now - status.st_mtime > _RETRY_DELAY
-                if stat.S_ISREG(status.st_mode) and _FILE_PATTERN.fullmatch(path.name):
-                    if path.suffix in (".so", ".json"):
-                        libraries.append((status.st_mtime, status.st_size, path))
-                    elif is_old:
-                        path.unlink()
-                elif (
-                    stat.S_ISDIR(status.st_mode) and _BUILD_PATTERN.fullmatch(path.name) and is_old
-                ):
+                is_own_file = stat.S_ISREG(status.st_mode) and _FILE_PATTERN.fullmatch(path.name)
+                is_own_folder = stat.S_ISDIR(status.st_mode) and _BUILD_PATTERN.fullmatch(path.name)
+                if is_own_file and path.suffix in (".so", ".json"):
+                    libraries.append((status.st_mtime, status.st_size, path))
+                elif is_own_file and is_old:
+                    path.unlink()
+                elif is_own_folder and is_old:
                     shutil.rmtree(path)  # does not follow symbolic links
         size = 0
         for count, (_, nbytes, path) in enumerate(sorted(libraries, reverse=True)):
@@ -232,8 +239,10 @@ class MachineCode:
     """Functions that are compiled together; not thread-safe."""
 
     def __init__(self, *functions: ca.Function) -> None:
-        self._interpreted = self._functions = functions
-        self._key, self._is_final = "", False
+        self._interpreted = functions
+        self._functions = functions
+        self._key = ""  # name of the library, once it has been computed
+        self._is_final = False
 
     @property
     def functions(self) -> tuple[ca.Function, ...]:
@@ -254,7 +263,8 @@ class MachineCode:
             return self.is_compiled
         # RuntimeError: from CasADi, or no thread can be started
         with contextlib.suppress(OSError, RuntimeError, ValueError):
-            folder, compiler = Libraries.open_default(), find_compiler()
+            folder = Libraries.open_default()
+            compiler = find_compiler()
             if folder is None or compiler is None:
                 return False
             if not self._key:
@@ -265,7 +275,8 @@ class MachineCode:
                     _start_worker_if_idle(folder)
             if folder.exists(self._key):
                 self._is_final = True  # loading is attempted only once
-                if (path := folder.find(self._key)) is not None:
+                path = folder.find(self._key)
+                if path is not None:
                     self._functions = _load_library(path, self._interpreted) or self._functions
         return self.is_compiled
 
@@ -282,7 +293,8 @@ def wait(timeout: float = 600.0) -> bool:
     Returns:
         Whether no function is left to be compiled.
     """
-    deadline, folder = time.monotonic() + timeout, Libraries.open_default()
+    deadline = time.monotonic() + timeout
+    folder = Libraries.open_default()
     if folder is None:
         return False
     with contextlib.suppress(OSError, subprocess.TimeoutExpired):
@@ -290,7 +302,7 @@ def wait(timeout: float = 600.0) -> bool:
             remaining = deadline - time.monotonic()
             process = _start_worker_if_idle(folder)
             has_died = process is not None and process.wait(max(remaining, 0.0))
-            if has_died and not any(map(folder.has_failed, jobs)):
+            if has_died and not any(folder.has_failed(key) for key in jobs):
                 return False  # it cannot start; if one library kills it, the next one continues
             if remaining < 0.0 or not has_python():
                 return False
@@ -301,7 +313,8 @@ def wait(timeout: float = 600.0) -> bool:
 
 def compile_jobs(path: str, lock: int) -> None:
     """Compile the jobs of a folder until none is left; `lock` is that of `Libraries.lock`."""
-    folder, finished = Libraries(Path(path)), set[str]()
+    folder = Libraries(Path(path))
+    finished = set[str]()
     while keys := set(folder.list_jobs()) - finished:
         for key in sorted(keys):
             try:
@@ -328,13 +341,13 @@ def _compile_job(folder: Libraries, key: str) -> None:
     compiler, texts = json.loads(folder.read_job(key))
     functions = tuple(ca.Function.deserialize(text) for text in texts)
     with tempfile.TemporaryDirectory(dir=folder.path, prefix=BUILD) as build:
-        library, code = Path(build) / "functions.so", ca.CodeGenerator("functions.c")
+        library = Path(build) / "functions.so"
+        code = ca.CodeGenerator("functions.c")
         for function in functions:
             code.add(function)
         code.generate(f"{build}/")
-        process = _start_process(
-            [*compiler, *_FLAGS, "functions.c", "-o", library.name, "-lm"], Path(build)
-        )
+        command = [*compiler, *_FLAGS, "functions.c", "-o", library.name, "-lm"]
+        process = _start_process(command, Path(build))
         try:
             status = process.wait(_COMPILER_TIMEOUT)
         finally:
@@ -352,31 +365,39 @@ def _load_library(
     try:
         with _LOAD_LOCK:
             loaded = tuple(ca.external(function.name(), str(path)) for function in functions)
-        pairs = zip(functions, loaded, strict=True)
-        return loaded if all(_is_identical(*pair, samples) for pair in pairs) else ()
+        for function, loaded_function in zip(functions, loaded, strict=True):
+            if not _is_identical(function, loaded_function, samples):
+                return ()
+        return loaded
     except RuntimeError:  # not a library for this machine, or different functions
         return ()
 
 
 def _is_identical(one: ca.Function, other: ca.Function, samples: int) -> bool:
     """Return whether two functions have equal signatures and bitwise equal results at samples."""
-    shapes = [
-        [f.sparsity_in(i) for i in range(f.n_in())] + [f.sparsity_out(i) for i in range(f.n_out())]
-        for f in (one, other)
-    ]
-    if one.n_in() != other.n_in() or shapes[0] != shapes[1]:
+    if one.n_in() != other.n_in() or _list_sparsities(one) != _list_sparsities(other):
         return False
     random = np.random.default_rng(0)
     for _ in range(samples):
-        inputs = [
-            ca.DM(one.sparsity_in(i), random.uniform(-2.0, 2.0, one.nnz_in(i)))
-            for i in range(one.n_in())
-        ]
-        for a, b in zip(one.call(inputs), other.call(inputs), strict=True):
-            a, b = np.array(a.nonzeros()), np.array(b.nonzeros())
-            if (a.view(np.int64) != b.view(np.int64))[~(np.isnan(a) & np.isnan(b))].any():
+        inputs = []
+        for i in range(one.n_in()):
+            values = random.uniform(-2.0, 2.0, one.nnz_in(i))
+            inputs.append(ca.DM(one.sparsity_in(i), values))
+        for result, other_result in zip(one.call(inputs), other.call(inputs), strict=True):
+            a = np.array(result.nonzeros())
+            b = np.array(other_result.nonzeros())
+            differs = a.view(np.int64) != b.view(np.int64)
+            are_nan = np.isnan(a) & np.isnan(b)
+            if differs[~are_nan].any():
                 return False
     return True
+
+
+def _list_sparsities(function: ca.Function) -> list[ca.Sparsity]:
+    """Return the sparsities of inputs and outputs."""
+    sparsities = [function.sparsity_in(i) for i in range(function.n_in())]
+    sparsities += [function.sparsity_out(i) for i in range(function.n_out())]
+    return sparsities
 
 
 def find_compiler() -> tuple[str, ...] | None:
@@ -386,16 +407,20 @@ def find_compiler() -> tuple[str, ...] | None:
     except ValueError:
         return None
     found = shutil.which(name)
-    return (found, *options) if found else None
+    if not found:
+        return None
+    return (found, *options)
 
 
 def _compute_key(compiler: tuple[str, ...], texts: list[str]) -> str:
     """Return the key of a library: a digest of functions, compiler and platform."""
-    status = Path(compiler[0]).stat()
-    machine = (platform.system(), platform.machine(), find_libc_version())
-    resolved = str(Path(compiler[0]).resolve())
+    executable = Path(compiler[0])
+    status = executable.stat()
+    resolved = str(executable.resolve())
     toolchain = (*compiler, resolved, status.st_size, status.st_mtime_ns, *_FLAGS)
-    digest = hashlib.sha256(json.dumps([toolchain, ca.CasadiMeta.version(), machine]).encode())
+    machine = (platform.system(), platform.machine(), find_libc_version())
+    environment = json.dumps([toolchain, ca.CasadiMeta.version(), machine])
+    digest = hashlib.sha256(environment.encode())
     for text in texts:
         digest.update(hashlib.sha256(text.encode()).digest())
     return digest.hexdigest()[:40]
@@ -406,12 +431,16 @@ def _start_worker_if_idle(folder: Libraries) -> subprocess.Popen[bytes] | None:
 
     It outlives this process, and ends when no job is left.
     """
-    if not has_python() or (lock := folder.lock()) is None:
+    if not has_python():
+        return None
+    lock = folder.lock()
+    if lock is None:
         return None
     try:  # the process inherits the lock
         # Where there is such a command, Python itself starts with low priority.
         nice = ["nice", "-n", str(_NICENESS)] if shutil.which("nice") else []
-        arguments = map(str, [folder.path, lock, _NICENESS, *map(os.path.abspath, sys.path)])
+        arguments = [str(folder.path), str(lock), str(_NICENESS)]
+        arguments += map(os.path.abspath, sys.path)  # the worker imports from the same folders
         command = [*nice, sys.executable, "-P", "-c", _WORKER_SCRIPT, *arguments]
         process = _start_process(command, folder.path, lock)
     finally:

@@ -53,15 +53,19 @@ class Plane:
 
     def values(self, z: Floats) -> Floats:
         """Return the distance predicted by the plane at z, shape (W, n): shape (W,) [m]."""
-        R, p = (part[:, 1:] for part in self.problem.chain.joint_placements(z))
-        columns = np.concatenate([R.swapaxes(2, 3), p[:, :, None]], axis=2).reshape(len(z), -1)
-        return np.asarray(self.margin + columns @ self.coefficients - self.offset)
+        rotations, translations = self.problem.chain.joint_placements(z)
+        columns_of_rotations = rotations[:, 1:].swapaxes(2, 3)
+        columns_of_translations = translations[:, 1:, None]
+        placements = np.concatenate([columns_of_rotations, columns_of_translations], axis=2)
+        stacked = placements.reshape(len(z), -1)  # vec(M)
+        return np.asarray(self.margin + stacked @ self.coefficients - self.offset)
 
     def distances(self, z: Floats) -> Floats:
         """Return the distance from coal at z, shape (W, n): shape (W,) [m]; NaN if out of reach."""
         reach = max(self.distance, 0.0) + _EXTRA_REACH
         found = self.contacts.evaluate(z, np.full(len(z), self.waypoint), reach=reach)
-        is_pair, distances = (found.pair == self.pair).all(axis=1), np.full(len(z), np.nan)
+        is_pair = (found.pair == self.pair).all(axis=1)
+        distances = np.full(len(z), np.nan)
         distances[found.waypoint[is_pair]] = found.distance[is_pair]
         return distances
 
@@ -74,7 +78,8 @@ def planes(problem: TrajectoryProblem, z: Floats, waypoint: int) -> list[Plane]:
         z: z_1..z_N, shape (N, n).
         waypoint: Waypoint, counted from 1.
     """
-    t, phase = problem.transcription, problem.contacts.find_phase(waypoint)
+    t = problem.transcription
+    phase = problem.contacts.find_phase(waypoint)
     labels = problem.contacts.phases[phase].labels
     model = problem.contacts.with_released_objects(z)
     waypoints = np.arange(1, problem.segments + 1)
@@ -90,21 +95,25 @@ def planes(problem: TrajectoryProblem, z: Floats, waypoint: int) -> list[Plane]:
     slopes = ca.Function("slopes", [t.x, t.parameters], [t.jacobian])
     jacobian = slopes(t.pack(z), parameters).sparse().tocsr()
     columns = (waypoint - 1) * t.width + np.arange(t.n)
-    return [
-        Plane(
+    row_of_z = waypoint - 1
+    found = list[Plane]()
+    for slot, k in enumerate(np.flatnonzero(contacts.waypoint == row_of_z)):
+        slopes_of_row = jacobian[int(t.slot_rows[row_of_z, slot])].toarray().ravel()
+        first, second = contacts.pair[k]
+        plane = Plane(
             problem=problem,
             contacts=model,
             waypoint=waypoint,
-            names=(labels[contacts.pair[k, 0]], labels[contacts.pair[k, 1]]),
+            names=(labels[first], labels[second]),
             pair=contacts.pair[k],
             distance=float(contacts.distance[k]),
             margin=float(contacts.margin[k]),
-            coefficients=coefficients[waypoint - 1, slot],
-            offset=float(offsets[waypoint - 1, slot]),
-            gradient=jacobian[int(t.slot_rows[waypoint - 1, slot])].toarray().ravel()[columns],
+            coefficients=coefficients[row_of_z, slot],
+            offset=float(offsets[row_of_z, slot]),
+            gradient=slopes_of_row[columns],
         )
-        for slot, k in enumerate(np.flatnonzero(contacts.waypoint == waypoint - 1))
-    ]
+        found.append(plane)
+    return found
 
 
 def sizes(problem: TrajectoryProblem) -> dict[str, int]:
@@ -112,7 +121,8 @@ def sizes(problem: TrajectoryProblem) -> dict[str, int]:
 
     The velocity and acceleration rows are part of the program only if it turns out to need them.
     """
-    t, (first, second) = problem.transcription, problem.rates(problem.still)
+    t = problem.transcription
+    velocities, accelerations = problem.rates(problem.still)
     fixed = int((problem.lower == problem.upper).sum())
     counts = {
         "variables: coordinates": problem.lower.size - fixed,
@@ -120,25 +130,28 @@ def sizes(problem: TrajectoryProblem) -> dict[str, int]:
         "variables: slacks": t.slot_rows.size,
         "variables: relaxation": t.segments,
     }
-    for goal, at in zip(problem.pose_goals, t.pose_rows, strict=True):
+    for goal, rows_by_waypoint in zip(problem.pose_goals, t.pose_rows, strict=True):
         kind = f"rows: {goal.name}"
-        counts[kind] = counts.get(kind, 0) + sum(len(rows) for rows in at.values())
-    return counts | {
-        "rows: witness planes": t.slot_rows.size,
-        "rows: rolling": len(t.base_rows),
-        "rows: clamped freedoms": sum(last - first for _, first, last in t.structure.clamped),
-        "rows: pushes": len(t.pushed_rows),
-        "rows: user-defined constraints": len(problem.term_evaluator.rows),
-        "only if needed: velocities": first.size,
-        "only if needed: accelerations": second.size,
-    }
+        rows_of_goal = sum(len(rows) for rows in rows_by_waypoint.values())
+        counts[kind] = counts.get(kind, 0) + rows_of_goal
+    clamped = sum(last - first for _, first, last in t.structure.clamped)
+    counts["rows: witness planes"] = t.slot_rows.size
+    counts["rows: rolling"] = len(t.base_rows)
+    counts["rows: clamped freedoms"] = clamped
+    counts["rows: pushes"] = len(t.pushed_rows)
+    counts["rows: user-defined constraints"] = len(problem.term_evaluator.rows)
+    counts["only if needed: velocities"] = velocities.size
+    counts["only if needed: accelerations"] = accelerations.size
+    return counts
 
 
 def patterns(problem: TrajectoryProblem) -> tuple[Any, Any]:
     """Return the sparsity of the rows' Jacobian and the Lagrangian's Hessian, as SciPy matrices."""
     t = problem.transcription
     upper = t.objective_curvature.sparsity() + t.hessian.sparsity()
-    return ca.DM(t.jacobian.sparsity(), 1.0).sparse(), ca.DM(upper + upper.T, 1.0).sparse()
+    jacobian = ca.DM(t.jacobian.sparsity(), 1.0)
+    hessian = ca.DM(upper + upper.T, 1.0)
+    return jacobian.sparse(), hessian.sparse()
 
 
 def build(
@@ -165,6 +178,7 @@ def build(
     options = Options() if options is None else check_instance(options, Options, "options")
     cache = None if cache is None else check_instance(cache, Cache, "cache")
     check_instance(scene, Scene, "scene")
-    task, terms = compile_task(scene, steps, options), trace_terms(scene, terms)
+    task = compile_task(scene, steps, options)
+    terms = trace_terms(scene, terms)
     check_terms_active(terms, summarize_phases(task))
     return TrajectoryProblem(scene, task, options, terms, cache=cache)

@@ -55,16 +55,22 @@ class Ipopt:
     """
 
     def __init__(self, function: ca.Function, monitor: Monitor, nbytes: int) -> None:
-        self.function, self.monitor, self.nbytes = function, monitor, nbytes
+        self.function = function
+        self.monitor = monitor
+        self.nbytes = nbytes
         self._buffer, self._run = function.buffer()
         self.stats: dict[str, Any] = {}
-        self.evaluation_time = self._total = 0.0
-        f = function
-        self._inputs = {f.name_in(i): np.zeros(f.nnz_in(i)) for i in range(f.n_in())}
-        self._outputs = {f.name_out(i): np.zeros(f.nnz_out(i)) for i in range(f.n_out())}
-        for i, values in enumerate(self._inputs.values()):
+        self.evaluation_time = 0.0
+        self._total = 0.0  # [s], evaluation time of all calls
+        self._inputs = dict[str, Floats]()
+        for i in range(function.n_in()):
+            values = np.zeros(function.nnz_in(i))
+            self._inputs[function.name_in(i)] = values
             self._buffer.set_arg(i, values.data)
-        for i, values in enumerate(self._outputs.values()):
+        self._outputs = dict[str, Floats]()
+        for i in range(function.n_out()):
+            values = np.zeros(function.nnz_out(i))
+            self._outputs[function.name_out(i)] = values
             self._buffer.set_res(i, values.data)
 
     def __call__(self, **values_by_name: Floats) -> dict[str, Floats]:
@@ -74,7 +80,8 @@ class Ipopt:
         self._run()
         self.stats = dict(self.function.stats(_MEMORY_INDEX))
         total = sum(value for key, value in self.stats.items() if key.startswith("t_wall_nlp_"))
-        self.evaluation_time, self._total = total - self._total, total
+        self.evaluation_time = total - self._total
+        self._total = total
         return {name: values.copy() for name, values in self._outputs.items()}
 
 
@@ -101,7 +108,8 @@ def make_ipopt(
         waypoints: Evaluations recorded per iteration.
     """
     weight, multipliers, hessian = lagrangian
-    inputs, names = [x, parameters], ["x", "p"]
+    inputs = [x, parameters]
+    names = ["x", "p"]
     monitor = Monitor(x.numel(), multipliers.numel(), parameters.numel(), waypoints)
     defaults = {
         "grad_f": ca.Function("nlp_grad_f", inputs, list(objective), names, ["f", "grad_f_x"]),
@@ -121,6 +129,10 @@ def make_ipopt(
         "inputs_check": False,  # it warns of more equations than variables, as in a phase at rest
     }
     record_evaluations()
-    program = {"x": x, "p": parameters, "f": objective[0], "g": rows[0]}
-    solver = ca.nlpsol("trajectory", "ipopt", program, {**defaults, **options})
-    return Ipopt(solver, monitor, BYTES_PER_ENTRY * (rows[1].nnz() + hessian.nnz()))
+    f, _ = objective
+    g, jacobian = rows
+    program = {"x": x, "p": parameters, "f": f, "g": g}
+    all_options = {**defaults, **options}
+    solver = ca.nlpsol("trajectory", "ipopt", program, all_options)
+    nbytes = BYTES_PER_ENTRY * (jacobian.nnz() + hessian.nnz())
+    return Ipopt(solver, monitor, nbytes)

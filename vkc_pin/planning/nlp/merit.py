@@ -54,10 +54,11 @@ class Infeasibility:
 
 def compute_shortfalls(contacts: Contacts, segments: int, slots: int) -> Floats:
     """Return the clearance shortfall of the pairs with witness planes, shape (N, K) [m]."""
-    shortfalls, slot = np.zeros((segments, slots)), contacts.slot
-    near = slot < slots
-    amounts = np.maximum((contacts.margin - contacts.distance)[near], 0.0)
-    shortfalls[contacts.waypoint[near], slot[near]] = amounts
+    shortfalls = np.zeros((segments, slots))
+    slot = contacts.slot
+    has_plane = slot < slots
+    amounts = np.maximum((contacts.margin - contacts.distance)[has_plane], 0.0)
+    shortfalls[contacts.waypoint[has_plane], slot[has_plane]] = amounts
     return shortfalls
 
 
@@ -66,30 +67,44 @@ def measure_infeasibility(
 ) -> Infeasibility:
     """Return the constraint violations at z_1..z_N, shape (N, n), with their contacts.
 
-    Velocity and acceleration limits count only with `rates`.
+    The violation of kind j at waypoint t, v_jt, is for "clearance" the sum of (margin − distance)⁺
+    over the pairs with planes, for "poses" that of ‖p − p*‖ + θ over the goals, and for all other
+    kinds that of the distances of rows from their bounds. Velocity and acceleration limits count
+    only with `rates`.
     """
     t = problem.transcription
     amounts = {kind: np.zeros(len(z)) for kind in ("poses", "rolling", "clamped", "terms", "rates")}
     amounts["clearance"] = compute_shortfalls(contacts, len(z), t.slots).sum(axis=1)
-    pose_offsets = np.zeros((len(z), len(problem.pose_goals), POSE_OFFSET_SIZE))
-    rotations, translations = problem.chain.joint_placements(z)
-    for k, goal in enumerate(problem.pose_goals):
-        if goal.row.waypoints:
-            at = np.array(goal.row.waypoints) - 1
-            placements = goal.row.compute_placements(rotations[at], translations[at])
-            pose_offsets[at, k] = compute_pose_offsets(goal.row.kind, *placements, goal.target)
+    pose_offsets = _compute_pose_offsets(problem, z)
     distances = np.linalg.norm(pose_offsets[:, :, :3], axis=2)
-    amounts["poses"] = distances.sum(axis=1) + pose_offsets[:, :, 6].sum(axis=1)
+    angles = pose_offsets[:, :, 6]
+    amounts["poses"] = distances.sum(axis=1) + angles.sum(axis=1)
     excess = problem.excess(z, timing, rates=rates)
     for kind, scale in problem.row_kinds.items():
         np.add.at(amounts[kind], t.row_waypoints, scale * np.abs(excess))
     rate_excess = np.zeros(0)
     if rates:
-        values = np.concatenate([part.ravel() for part in problem.rates(z)])
+        steps, changes = problem.rates(z)
+        values = np.concatenate([steps.ravel(), changes.ravel()])
         bound = np.concatenate([timing.velocity.ravel(), timing.acceleration.ravel()])
         rate_excess = values - np.clip(values, -bound, bound)
         np.add.at(amounts["rates"], t.rate_waypoints, np.abs(rate_excess))
     return Infeasibility(amounts, pose_offsets, excess, rate_excess)
+
+
+def _compute_pose_offsets(problem: TrajectoryProblem, z: Floats) -> Floats:
+    """Return the offset of each pose goal where it applies, else zero, shape (N, poses, 7)."""
+    pose_offsets = np.zeros((len(z), len(problem.pose_goals), POSE_OFFSET_SIZE))
+    rotations, translations = problem.chain.joint_placements(z)
+    for k, goal in enumerate(problem.pose_goals):
+        if not goal.row.waypoints:
+            continue
+        at = np.array(goal.row.waypoints) - 1
+        rotation, translation = goal.row.compute_placements(rotations[at], translations[at])
+        pose_offsets[at, k] = compute_pose_offsets(
+            goal.row.kind, rotation, translation, goal.target
+        )
+    return pose_offsets
 
 
 class Merit:
@@ -109,8 +124,11 @@ class Merit:
 
     def compute_penalty(self, infeasibility: Infeasibility, *, clearance: bool) -> Floats:
         """Return the penalty at each waypoint, shape (N,), with or without clearance."""
-        kinds = (kind for kind in self.weights if clearance or kind != "clearance")
-        return np.asarray(sum(self.weights[kind] * infeasibility.amounts[kind] for kind in kinds))
+        penalties = []
+        for kind, weight in self.weights.items():
+            if clearance or kind != "clearance":
+                penalties.append(weight * infeasibility.amounts[kind])
+        return np.asarray(sum(penalties))
 
     def increase_weights(self, infeasibility: Infeasibility, clearance_tolerance: float) -> bool:
         """Increase the weights of violated kinds; return whether any increased.

@@ -19,8 +19,12 @@ def find_change_steps(stops: Sequence[int], segments: int) -> list[int]:
 
     That is the step before the change, or the first step of a run between two stops.
     """
-    runs = itertools.pairwise([0, *stops, segments])
-    return [max(waypoint, 1) - 1 for begin, end in runs for waypoint in range(begin, end + 1)]
+    steps = list[int]()
+    for begin, end in itertools.pairwise([0, *stops, segments]):
+        # The first change of a run is from rest to its first step.
+        waypoints = range(begin, end + 1)
+        steps += [max(waypoint, 1) - 1 for waypoint in waypoints]
+    return steps
 
 
 class MotionCost:
@@ -47,11 +51,13 @@ class MotionCost:
     def __init__(
         self, metric: Floats, smoothing: float, ends: Ints, stops: Sequence[int], *, length: bool
     ) -> None:
-        self.metric, self.smoothing, self.length = metric, smoothing, length
-        self._counts = np.diff(ends, prepend=0)
-        phase = np.repeat(np.arange(len(self._counts)), self._counts)
-        # phases of the steps, and of their changes
-        self._phases = phase, phase[find_change_steps(stops, len(phase))]
+        self.metric = metric
+        self.smoothing = smoothing
+        self.length = length
+        self._counts = np.diff(ends, prepend=0)  # m_p, steps of each phase
+        self._phase_of_step = np.repeat(np.arange(len(self._counts)), self._counts)
+        change_steps = find_change_steps(stops, len(self._phase_of_step))
+        self._phase_of_change = self._phase_of_step[change_steps]
 
     def value(self, steps: Floats, changes: Floats) -> float:
         """Return f for steps δz, shape (N, n), and changes δδz, shape (N + 1 + stops, n)."""
@@ -68,13 +74,19 @@ class MotionCost:
 
         The model has the value (up to a constant) and the gradient of f at the given steps, and
         bounds f from above: √q ≤ (q/√q̄ + √q̄)/2 (iteratively reweighted least squares; Hunter and
-        Lange, A tutorial on MM algorithms, 2004). The weights have the shapes of the arguments.
+        Lange, A tutorial on MM algorithms, 2004). With q = ε_g² + m_p·E_pg this is E_pg times
+
+            m_p / (2·√(ε_g² + m_p·Ē_pg))
+
+        plus a constant. The weights have the shapes of the arguments.
         """
         scale = np.ones((len(self._counts), len(self.metric)))
         if self.length:
-            counts, energies = self._counts[:, None], self._compute_energies(steps, changes)
+            counts = self._counts[:, None]
+            energies = self._compute_energies(steps, changes)
             scale = counts / (2.0 * np.sqrt(self._smoothing_lengths**2 + counts * energies))
-        step_weights, change_weights = (scale[phase] * self.metric for phase in self._phases)
+        step_weights = scale[self._phase_of_step] * self.metric
+        change_weights = scale[self._phase_of_change] * self.metric
         return step_weights, self.smoothing * change_weights
 
     @property
@@ -85,8 +97,8 @@ class MotionCost:
     def _compute_energies(self, steps: Floats, changes: Floats) -> Floats:
         """Return E_pg of each coordinate's group (for squares, of the coordinate), shape (P, n)."""
         energies = np.zeros((len(self._counts), len(self.metric)))
-        np.add.at(energies, self._phases[0], self.metric * steps**2)
-        np.add.at(energies, self._phases[1], self.smoothing * self.metric * changes**2)
+        np.add.at(energies, self._phase_of_step, self.metric * steps**2)
+        np.add.at(energies, self._phase_of_change, self.smoothing * self.metric * changes**2)
         if self.length:
             energies[:, :2] = energies[:, :2].sum(axis=1, keepdims=True)
         return energies

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from typing import Literal
 
@@ -27,7 +26,7 @@ class PoseGoal:
             "approach", the start of the straight path to a grasp; "level", for a carrier on which
             another object rests; "goal" of a step.
         about: Subject for messages: an object, a hold or a frame.
-        object: The object that is held or grasped; None for the goal of a step.
+        object: The grasped object; None for the goal of a step.
     """
 
     row: PoseRow
@@ -44,8 +43,13 @@ class PoseGoal:
 
 def find_phase_spans(task: Task) -> list[tuple[Phase, int, int]]:
     """Return each phase with its first and last waypoint."""
-    ends = list(itertools.accumulate(phase.segments for phase in task.phases))
-    return list(zip(task.phases, [0, *ends[:-1]], ends, strict=True))
+    spans = []
+    first = 0
+    for phase in task.phases:
+        last = first + phase.segments
+        spans.append((phase, first, last))
+        first = last
+    return spans
 
 
 def make_pose_goals(
@@ -53,47 +57,65 @@ def make_pose_goals(
 ) -> tuple[PoseGoal, ...]:
     """Return the pose goals of a task: grasps and closures, then approaches and goals of steps."""
     spans = find_phase_spans(task)
-    goals = [goal for hold in task.holds for goal in _make_grasp_goals(scene, chain, hold, spans)]
+    goals = list[PoseGoal]()
+    for hold in task.holds:
+        goals += _make_grasp_goals(scene, chain, hold, spans)
     for phase, first, last in spans:
-        # retreat from the grasp, straight back along the approach direction
-        for hold in phase.grasps:
-            closure = chain.closures[hold]
-            target = phase.resting.get(hold.object, closure.target)
-            joint, frame = chain.holder(hold)
-            x, y, z = (options.approach * frame.rotation[:, 2]).tolist()
-            at = find_approach_waypoint(first, last, options)
-            if at < last:  # otherwise the phase is too short for an approach
-                row = PoseRow(closure.joint, closure.local, (at,), shift=(joint, (x, y, z)))
-                goals.append(PoseGoal(row, target, "approach", str(hold), hold.object))
-        for hold, ride in {ride.hold: ride for ride in phase.supported}.items():
+        at = find_approach_waypoint(first, last, options)
+        if at < last:  # otherwise the phase is too short for an approach
+            for hold in phase.grasps:
+                goals.append(_make_approach_goal(chain, phase, hold, at, options.approach))
+        supported_by_hold = {supported.hold: supported for supported in phase.supported}
+        for hold, supported in supported_by_hold.items():
             carrier = scene.objects[hold.object].object
             if carrier.free:
-                waypoints = tuple(range(first + 1, last + 1))
-                row = PoseRow(*chain.frame(carrier.base_link, hold), waypoints, "level")
-                level = ride.carrier_placement
+                joint, local = chain.frame(carrier.base_link, hold)
+                row = PoseRow(joint, local, tuple(range(first + 1, last + 1)), "level")
+                level = supported.carrier_placement
                 goals.append(PoseGoal(row, level, "level", hold.object, hold.object))
         for goal in phase.frames:
-            frame = chain.frame(goal.frame, goal.hold, opening=phase.opening)
-            row = PoseRow(*frame, (last,), goal.kind)
+            joint, local = chain.frame(goal.frame, goal.hold, opening=phase.opening)
+            row = PoseRow(joint, local, (last,), goal.kind)
             goals.append(PoseGoal(row, goal.placement, "goal", str(goal)))
     return tuple(goals)
+
+
+def _make_approach_goal(
+    chain: VirtualKinematicChain, phase: Phase, hold: Hold, waypoint: int, distance: float
+) -> PoseGoal:
+    """Return the goal that the hand is straight behind its grasp by a `distance` [m].
+
+    The object is where it would be after a retreat along the approach direction, the z axis n of
+    the holder: p + distance·n = p* for the object's position p and its target p*.
+    """
+    closure = chain.closures[hold]
+    target = phase.resting.get(hold.object, closure.target)
+    joint, frame = chain.holder(hold)
+    x, y, z = (distance * frame.rotation[:, 2]).tolist()
+    row = PoseRow(closure.joint, closure.local, (waypoint,), shift=(joint, (x, y, z)))
+    return PoseGoal(row, target, "approach", str(hold), hold.object)
 
 
 def _make_grasp_goals(
     scene: Scene, chain: VirtualKinematicChain, hold: Hold, spans: list[tuple[Phase, int, int]]
 ) -> list[PoseGoal]:
     """Return the goals of the grasps of a free object, or the closure of another one."""
-    closure, waypoints, goals = chain.closures[hold], list[int](), list[PoseGoal]()
-    is_free, name = scene.objects[hold.object].object.free, hold.object
+    closure = chain.closures[hold]
+    name = hold.object
+    goals = list[PoseGoal]()
+    if scene.objects[name].object.free:
+        for phase, _, last in spans:
+            if hold in phase.grasps:
+                row = PoseRow(closure.joint, closure.local, (last,))
+                goals.append(PoseGoal(row, phase.resting[name], "grasp", str(hold), name))
+        return goals
+    waypoints = list[int]()
     for phase, first, last in spans:
-        if hold in phase.grasps and is_free:
-            row = PoseRow(closure.joint, closure.local, (last,))
-            goals.append(PoseGoal(row, phase.resting[name], "grasp", str(hold), name))
-        elif hold in phase.grasps:
+        if hold in phase.grasps:
             waypoints.append(last)
         elif hold in phase.held:
             waypoints += range(first + 1, last + 1)
-    if waypoints and not is_free:
+    if waypoints:
         row = PoseRow(closure.joint, closure.local, tuple(waypoints))
         goals.append(PoseGoal(row, closure.target, "closure", name, name))
     return goals
@@ -117,18 +139,19 @@ def find_pushed_coordinates(
     chain: VirtualKinematicChain, task: Task
 ) -> tuple[tuple[int, int, int, int], ...]:
     """Return (column, first waypoint, last waypoint, direction ±1) of each pushed coordinate."""
-    return tuple(
-        (chain.index(name), first, last, direction)
-        for phase, first, last in find_phase_spans(task)
-        for name, direction in phase.pushed.items()
-    )
+    pushed = []
+    for phase, first, last in find_phase_spans(task):
+        for name, direction in phase.pushed.items():
+            pushed.append((chain.index(name), first, last, direction))
+    return tuple(pushed)
 
 
 def find_chosen_freedoms(
     scene: Scene, chain: VirtualKinematicChain, task: Task
 ) -> tuple[tuple[int, int, int], ...]:
     """Return (column, grasp waypoint, last waypoint held) of each freedom chosen when clamping."""
-    freedoms, spans = [], find_phase_spans(task)
+    freedoms = []
+    spans = find_phase_spans(task)
     for hold, names in chain.virtual.items():
         attachment = scene.objects[hold.object].object.attachments[hold.attachment]
         for number, (phase, _, grasp) in enumerate(spans):

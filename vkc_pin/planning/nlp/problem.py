@@ -76,7 +76,10 @@ class TrajectoryProblem:
         *,
         cache: Cache | None = None,
     ) -> None:
-        self.scene, self.task, self.options, self.cache = scene, task, options, cache or Cache()
+        self.scene = scene
+        self.task = task
+        self.options = options
+        self.cache = cache or Cache()
         self.chain: VirtualKinematicChain = consolidate(
             scene, task.holds, rides=task.supported, cache=self.cache
         )
@@ -91,17 +94,19 @@ class TrajectoryProblem:
         self.motion_cost = self._make_motion_cost()
         self.start = self._make_start()
         self.lower, self.upper = self._make_bounds()
-        for array in (self.start, self.lower, self.upper):
-            array.setflags(write=False)
+        self.start.setflags(write=False)
+        self.lower.setflags(write=False)
+        self.upper.setflags(write=False)
         self.term_evaluator = TermEvaluator(self.terms, self.transcription, self.start)
         self.term_evaluator.check(self.still, np.full(self.segments, options.dt))
 
     def with_bounds(self, lower: Floats, upper: Floats) -> TrajectoryProblem:
         """Return the same problem with other bounds of z_1..z_N, shape (N, n)."""
         other = copy.copy(self)
-        other.lower, other.upper = lower.copy(), upper.copy()
-        for array in (other.lower, other.upper):
-            array.setflags(write=False)
+        other.lower = lower.copy()
+        other.upper = upper.copy()
+        other.lower.setflags(write=False)
+        other.upper.setflags(write=False)
         return other
 
     @property
@@ -116,52 +121,59 @@ class TrajectoryProblem:
 
     def _make_structure(self, terms: tuple[TermRow, ...]) -> Structure:
         """Return the structure of the program: pose goals, stops, clamped coordinates, etc."""
-        o, spans = self.options, find_phase_spans(self.task)
+        spans = find_phase_spans(self.task)
         # Clamped freedoms are constant from the start of the straight approach, because the hand
         # already has to be where it will close.
-        starts = {end: start for _, start, end in spans}
-        clamped = tuple(
-            (column, find_approach_waypoint(starts[grasp], grasp, o), last)
-            for column, grasp, last in self.choices
-        )
+        first_waypoints = {last: first for _, first, last in spans}
+        clamped = []
+        for column, grasp, last in self.choices:
+            approach = find_approach_waypoint(first_waypoints[grasp], grasp, self.options)
+            clamped.append((column, approach, last))
         # The robot is at rest while its gripper closes or opens.
-        stops = tuple(
-            end
-            for (phase, _, end), (after, _, _) in itertools.pairwise(spans)
-            if phase.grasps or after.released
-        )
+        stops = []
+        for (phase, _, end), (next_phase, _, _) in itertools.pairwise(spans):
+            if phase.grasps or next_phase.released:
+                stops.append(end)
         return Structure(
             model=self.chain.model,
             segments=self.segments,
             poses=tuple(goal.row for goal in self.pose_goals),
-            slots=o.contact_slots,
-            stops=stops,
+            slots=self.options.contact_slots,
+            stops=tuple(stops),
             rolling=self.rolling,
-            clamped=clamped,
+            clamped=tuple(clamped),
             pushed=find_pushed_coordinates(self.chain, self.task),
             terms=terms,
         )
 
     def _make_motion_cost(self) -> MotionCost:
         """Return the motion cost: one weight for all lengths, turns weighted by group of joints."""
-        o, robot = self.options, self.chain.robot.coordinates.size
-        metric = np.full(self.chain.size, o.velocity_weight_object)
-        metric[2], metric[3:robot] = o.velocity_weight_heading, o.velocity_weight_arm
-        coordinates = self.chain.coordinates  # the displacements of coupled joints add up
-        metric = metric * coordinates.turns**2 + o.velocity_weight_base * coordinates.lengths**2
+        o = self.options
+        turn_weights = np.full(self.chain.size, o.velocity_weight_object)
+        turn_weights[2] = o.velocity_weight_heading
+        turn_weights[3 : self.chain.robot.coordinates.size] = o.velocity_weight_arm
+        # The displacements of coupled joints add up.
+        turns = self.chain.coordinates.turns
+        lengths = self.chain.coordinates.lengths
+        metric = turn_weights * turns**2 + o.velocity_weight_base * lengths**2
         metric[[column for column, _, _ in self.choices]] *= _CHOSEN_FREEDOM_WEIGHT
-        smoothing, length = o.acceleration_weight / o.dt**2, o.objective == "path_length"
-        stops = self.transcription.structure.stops
-        return MotionCost(metric, smoothing, self.ends, stops, length=length)
+        return MotionCost(
+            metric,
+            o.acceleration_weight / o.dt**2,
+            self.ends,
+            self.transcription.structure.stops,
+            length=o.objective == "path_length",
+        )
 
     def _make_start(self) -> Floats:
+        """Return z_0: the robot, joints of objects, and freedoms of grasps at the start."""
         start = np.zeros(self.chain.size)
         start[: len(self.scene.start)] = self.scene.start
         for name, value in self.task.state.items():
             start[self.chain.index(name)] = value
         for hold in self._continued_holds:
-            names = self.scene.objects[hold.object].object.attachment(hold.attachment).coordinates
-            for name, value in zip(names, hold.at, strict=True):
+            attachment = self.scene.objects[hold.object].object.attachment(hold.attachment)
+            for name, value in zip(attachment.coordinates, hold.at, strict=True):
                 start[self.chain.index(f"{hold.object}.{name}")] = value
         return start
 
@@ -182,15 +194,15 @@ class TrajectoryProblem:
             if phase.kind == "stand" and not self.is_closed(phase):
                 bounds[inside, robot] = self.start[robot, None]  # a released object does not move
             for name, value in phase.initial_values.items():
-                low_high = phase.ranges.get(name, (value, value))
-                bounds[inside, self.chain.index(name)] = low_high
+                bounds[inside, self.chain.index(name)] = phase.ranges.get(name, (value, value))
             for name, interval in self.coordinate_goals(phase).items():
                 bounds[end - 1, self.chain.index(name)] = np.clip(interval, *self.limits(name))
         # Clamped freedoms are constant until the object is released.
         for hold in self._continued_holds:
             if self.scene.objects[hold.object].object.attachments[hold.attachment].firm:
                 until = find_end_of_hold(hold, find_phase_spans(self.task), 0)
-                for column in map(self.chain.index, self.chain.virtual[hold]):
+                for name in self.chain.virtual[hold]:
+                    column = self.chain.index(name)
                     bounds[:until, column] = self.start[column]
         lower, upper = bounds.transpose(2, 0, 1).copy()
         return lower, upper
@@ -200,8 +212,9 @@ class TrajectoryProblem:
 
         See `compute_step_times`. User-defined terms may require longer steps.
         """
-        structure, path = self.transcription.structure, self.waypoints(z)
-        limits = self.chain.velocity, self.chain.acceleration
+        structure = self.transcription.structure
+        path = self.waypoints(z)
+        limits = (self.chain.velocity, self.chain.acceleration)
         runs = split_at_stops(structure.stops, self.segments)
         least = self.rolling.compute_min_times(path)
         dt = compute_step_times(path, self.options.dt, runs, limits, least)
@@ -221,10 +234,12 @@ class TrajectoryProblem:
         column = self.chain.index(name)
         if column < 3 and self.chain.robot.base == "fixed":
             return float(self.start[column]), float(self.start[column])
-        lower, upper = float(self.chain.lower[column]), float(self.chain.upper[column])
+        lower = float(self.chain.lower[column])
+        upper = float(self.chain.upper[column])
         if column < 2:
-            low, high = self.scene.arena[2 * column : 2 * column + 2]
-            lower, upper = max(lower, low), min(upper, high)
+            arena_lower, arena_upper = self.scene.arena[2 * column : 2 * column + 2]
+            lower = max(lower, arena_lower)
+            upper = min(upper, arena_upper)
         return lower, upper
 
     def coordinate_goals(self, phase: Phase) -> dict[str, tuple[float, float]]:
@@ -235,11 +250,11 @@ class TrajectoryProblem:
         goals = {name: (value, value) for name, value in phase.values.items()}
         for name, (lower, upper) in phase.configuration.items():
             column = self.chain.index(name)
-            turns = 0.0
+            full_turns = 0.0  # [rad], a multiple of 2π
             if self.chain.robot.is_periodic(column):
-                away = (lower + upper) / 2 - self.start[column]
-                turns = wrap_angle(away) - away
-            goals[name] = lower + turns, upper + turns
+                from_start = (lower + upper) / 2 - self.start[column]
+                full_turns = wrap_angle(from_start) - from_start
+            goals[name] = (lower + full_turns, upper + full_turns)
         return goals
 
     def unit(self, name: str) -> str:
@@ -262,15 +277,16 @@ class TrajectoryProblem:
             reach: Pairs further apart are omitted [m].
             nearest: Maximum number of pairs per waypoint. Defaults to all.
         """
-        return self.contacts.with_released_objects(z).evaluate(
-            z, np.arange(1, self.segments + 1), reach=reach, nearest=nearest
-        )
+        contacts = self.contacts.with_released_objects(z)
+        waypoints = np.arange(1, self.segments + 1)
+        return contacts.evaluate(z, waypoints, reach=reach, nearest=nearest)
 
     def rates(self, z: Floats) -> tuple[Floats, Floats]:
         """Return the steps δz, shape (N, n), and their changes δδz, shape (N + 1 + stops, n)."""
         t = self.transcription
-        first = t.first @ z + np.outer(t.start_first, self.start)
-        return first, t.second @ z + np.outer(t.start_second, self.start)
+        steps = t.first @ z + np.outer(t.start_first, self.start)
+        changes = t.second @ z + np.outer(t.start_second, self.start)
+        return steps, changes
 
     def pace(self, z: Floats) -> tuple[Floats, Floats, Floats]:
         """Return `rates` and the minimum step durations for the wheels, shape (N,) [s]."""
@@ -312,8 +328,9 @@ class TrajectoryProblem:
     def row_kinds(self) -> Mapping[str, Floats]:
         """For each kind of these rows, the factor of their excess; 0 for rows of other kinds."""
         t = self.transcription
-        rolling, terms = np.zeros(t.rows), np.zeros(t.rows)
+        rolling = np.zeros(t.rows)
         rolling[t.base_rows] = 1.0
+        terms = np.zeros(t.rows)
         terms[self.term_evaluator.rows] = self.term_evaluator.scale
         clamped = np.where((rolling == 0.0) & (terms == 0.0), 1.0, 0.0)
         kinds = {"rolling": rolling, "clamped": clamped, "terms": terms}
@@ -324,33 +341,40 @@ class TrajectoryProblem:
 
         It is evaluated half-way between consecutive waypoints.
         """
-        path, worst = self.waypoints(z), 0.0
+        path = self.waypoints(z)
         midpoints = (path[1:] + path[:-1]) / 2
         allowed = np.array([_TOLERANCES.closure_position, _TOLERANCES.closure_angle])
+        worst = 0.0
         for goal, solver in zip(self.pose_goals, self.transcription.pose_solvers, strict=True):
             at = goal.row.waypoints
-            closed = [t - 1 for t in at if t - 1 in at]
-            if closed and goal.kind == "closure":
-                residual, _ = solver.evaluate(midpoints[closed], goal.target)
-                amounts = np.linalg.norm(residual.reshape(len(closed), 2, 3), axis=2)
+            closed_segments = [t - 1 for t in at if t - 1 in at]  # closed at both ends
+            if closed_segments and goal.kind == "closure":
+                residual, _ = solver.evaluate(midpoints[closed_segments], goal.target)
+                errors = residual.reshape(len(closed_segments), 2, 3)  # position and rotation
+                amounts = np.linalg.norm(errors, axis=2)
                 worst = max(worst, float((amounts / allowed).max()))
         return worst
 
     def row_bounds(self, timing: Timing | None) -> tuple[Floats, Floats]:
         """Return the bounds of the rows, followed by those of the rates if a timing is given."""
-        t, terms = self.transcription, self.term_evaluator
-        lower, upper = np.zeros(t.rows), np.zeros(t.rows)
-        upper[t.slot_rows] = upper[t.pushed_rows] = np.inf
-        for pose, at in zip(t.structure.poses, t.pose_rows, strict=True):
-            for rows in at.values():
+        t = self.transcription
+        terms = self.term_evaluator
+        lower = np.zeros(t.rows)
+        upper = np.zeros(t.rows)
+        upper[t.slot_rows] = np.inf
+        upper[t.pushed_rows] = np.inf
+        for pose, rows_by_waypoint in zip(t.structure.poses, t.pose_rows, strict=True):
+            for rows in rows_by_waypoint.values():
                 lower[rows], upper[rows] = ROW_BOUNDS[pose.kind]
-        lower[terms.rows], upper[terms.rows] = terms.lower, terms.upper
+        lower[terms.rows] = terms.lower
+        upper[terms.rows] = terms.upper
         if not self.rolling.is_omnidirectional:
             dt = None if timing is None else timing.dt
             lower[t.base_rows], upper[t.base_rows] = t.steps.bounds(dt)
         if timing is not None:
             rates = np.concatenate([timing.velocity.ravel(), timing.acceleration.ravel()])
-            lower, upper = np.concatenate([lower, -rates]), np.concatenate([upper, rates])
+            lower = np.concatenate([lower, -rates])
+            upper = np.concatenate([upper, rates])
         return lower, upper
 
     def parameters_at(self, z: Floats) -> dict[str, Floats]:
@@ -365,9 +389,12 @@ class TrajectoryProblem:
         }
 
     def __repr__(self) -> str:
-        t, time = self.transcription, self.timing_for(self.still).dt.sum()
+        t = self.transcription
+        phases = " → ".join(phase.name for phase in self.task.phases)
+        duration = self.timing_for(self.still).dt.sum()
+        pairs = sum(len(part.pairs) for part in self.contacts.phases)
         return (
-            f"<TrajectoryProblem {' → '.join(p.name for p in self.task.phases)}: "
-            f"{self.segments} steps in {time:g} s, {t.size} variables, {t.rows} rows, "
-            f"{sum(len(p.pairs) for p in self.contacts.phases)} collision pairs>"
+            f"<TrajectoryProblem {phases}: "
+            f"{self.segments} steps in {duration:g} s, {t.size} variables, {t.rows} rows, "
+            f"{pairs} collision pairs>"
         )

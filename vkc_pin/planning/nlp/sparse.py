@@ -27,18 +27,24 @@ def make_sparse(matrix: Floats) -> ca.DM:
 def assemble(parts: list[ca.MX], at: list[Ints], rows: int, columns: int) -> ca.MX:
     """Return a sparse matrix of nonzeros `parts` at (row, column) `at`; duplicates are summed."""
     positions = np.concatenate(at, axis=1)
-    order = np.lexsort((positions[0], positions[1]))
     values = ca.vertcat(*parts)
-    is_first = np.concatenate([[True], np.diff(positions[:, order]).any(axis=0)])[: len(order)]
+    count = positions.shape[1]
+    # CasADi stores nonzeros column by column.
+    order = np.lexsort((positions[0], positions[1]))
+    differs_from_last = np.diff(positions[:, order]).any(axis=0)
+    is_first = np.concatenate([[True], differs_from_last])[:count]  # of its duplicates
     if is_first.all():
         values = values[order.tolist()]
     else:
-        target = np.empty(len(order), int)
+        # A matrix of ones adds the duplicates: entry k is part of nonzero target[k].
+        target = np.empty(count, int)
         target[order] = np.cumsum(is_first) - 1
-        n, columns_of_sums, ones = len(order), list(range(len(order))), ca.DM.ones(len(order))
-        sums = ca.DM.triplet(target.tolist(), columns_of_sums, ones, int(is_first.sum()), n)
+        nonzero_count = int(is_first.sum())
+        sums = ca.DM.triplet(
+            target.tolist(), list(range(count)), ca.DM.ones(count), nonzero_count, count
+        )
         values = sums @ values
-    row, column = positions[0][order][is_first], positions[1][order][is_first]
+    row, column = positions[:, order[is_first]]
     pointers = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=columns))])
     pattern = ca.Sparsity(rows, columns, pointers.tolist(), row.tolist())
     return ca.MX(pattern, values)
@@ -47,21 +53,31 @@ def assemble(parts: list[ca.MX], at: list[Ints], rows: int, columns: int) -> ca.
 def make_differences(segments: int, stops: Sequence[int]) -> tuple[Floats, Floats, Floats, Floats]:
     """Return matrices D, E and vectors d, e that map z_1..z_N and z_0 to steps and their changes.
 
-    D·z + d·z_0 are the steps, E·z + e·z_0 their changes: between steps, and from and to rest where
-    the motion starts, stops and ends.
+    D·z + d·z_0 are the steps δz_t = z_t − z_{t−1}, E·z + e·z_0 their changes δz_{t+1} − δz_t:
+    between steps, and from and to rest, δz = 0, where the motion starts, stops and ends. With the
+    matrix A that maps the steps to their changes, E = A·D and e = A·d.
     """
-    first = np.eye(segments) - np.eye(segments, k=-1)  # δz_t = z_t − z_{t−1}
+    first = np.eye(segments) - np.eye(segments, k=-1)
     start = np.zeros(segments)
     start[0] = -1.0
-    runs = [np.eye(segments)[a:b] for a, b in itertools.pairwise([0, *stops, segments])]
-    changes = np.vstack([np.diff(run, axis=0, prepend=0.0, append=0.0) for run in runs])
+    changes_of_runs = []
+    for begin, end in itertools.pairwise([0, *stops, segments]):
+        steps = np.eye(segments)[begin:end]
+        changes_of_runs.append(np.diff(steps, axis=0, prepend=0.0, append=0.0))
+    changes = np.vstack(changes_of_runs)
     return first, changes @ first, start, changes @ start
 
 
 def make_curvature(parts: Sequence[Floats]) -> tuple[tuple[Ints, Ints], list[ca.DM]]:
     """Return the pattern of ∇²Σ_k Σ_r w_kr (A_k z)_r², upper triangle, and its matrices.
 
-    That is rows and columns of the nonzeros, and for each A_k the matrix that maps w_k to them.
+    That is rows and columns of the nonzeros, and for each A_k the matrix that maps w_k to them: the
+    entry (i, j) of the Hessian is Σ_k Σ_r 2 (A_k)_ri (A_k)_rj w_kr.
     """
-    row, column = np.triu(sum(np.abs(part).T @ np.abs(part) for part in parts)).nonzero()
-    return (row, column), [make_sparse(2 * (part[:, row] * part[:, column]).T) for part in parts]
+    magnitude = sum(np.abs(part).T @ np.abs(part) for part in parts)
+    row, column = np.triu(magnitude).nonzero()
+    matrices = []
+    for part in parts:
+        products = part[:, row] * part[:, column]
+        matrices.append(make_sparse(2 * products.T))
+    return (row, column), matrices

@@ -21,7 +21,8 @@ from vkc_pin.world.task.phases import Task, summarize_phases
 from vkc_pin.world.task.terms import Cost, Term
 
 # factor by which steps are lengthened at a time, and its maximum in total
-_STRETCH_FACTOR, _MAX_STRETCH = 1.2, 8.0
+_STRETCH_FACTOR = 1.2
+_MAX_STRETCH = 8.0
 # Scaled violation of a term that is violated by its tolerance, comparable to pose residuals.
 _TOLERANCE_SCALE = 1e-3
 
@@ -31,36 +32,47 @@ def locate_terms(
 ) -> tuple[tuple[TermRow, ...], tuple[Term, ...]]:
     """Return the program rows of traced terms that can change something, and these terms."""
     locator = _FrameLocator(scene, chain, task)
-    rows, used_terms = [], []
+    rows = []
+    used_terms = []
     for term in terms:
-        formula, locations = term.formula, []
-        for number, (name, held) in enumerate(summarize_phases(task)):
-            if not term.is_active(name, held):
-                continue
-            _, first, last = locator.spans[number]
-            for waypoint in range(first + 1, last + 1):
-                earlier = number if waypoint - 1 > first else max(number - 1, 0)
-                now, before = (
-                    tuple(locator.locate_frame(frame, phase, t) for frame in formula.frames)
-                    for phase, t in ((number, waypoint), (earlier, waypoint - 1))
-                )
-                locations.append(TermLocation(waypoint, now, before))
+        formula = term.formula
         values = tuple(locator.resolve_coordinate(name) for name in formula.coordinates)
         weight = term.weight if isinstance(term, Cost) else None
         row = TermRow(formula, weight, values, ())
-        # the others are constant
-        locations = [at for at in locations if any(waypoint > 0 for waypoint in row.kind(at)[0])]
+        locations = []
+        for location in _locate_term(locator, term, task):
+            waypoints, _ = row.kind(location)
+            if any(waypoint > 0 for waypoint in waypoints):  # otherwise it is constant
+                locations.append(location)
         if locations:
             rows.append(TermRow(formula, weight, values, tuple(locations)))
             used_terms.append(term)
     return tuple(rows), tuple(used_terms)
 
 
+def _locate_term(locator: _FrameLocator, term: Term, task: Task) -> list[TermLocation]:
+    """Return the locations of a term at the waypoints of its phases after their first."""
+    locations = []
+    for number, (name, held) in enumerate(summarize_phases(task)):
+        if not term.is_active(name, held):
+            continue
+        _, first, last = locator.spans[number]
+        for waypoint in range(first + 1, last + 1):
+            now = locator.locate_frames(term.formula.frames, number, waypoint)
+            # The first waypoint of a phase is the last of the one before.
+            number_before = number if waypoint - 1 > first else max(number - 1, 0)
+            before = locator.locate_frames(term.formula.frames, number_before, waypoint - 1)
+            locations.append(TermLocation(waypoint, now, before))
+    return locations
+
+
 class _FrameLocator:
     """Locates frames and coordinates at the waypoints of a task."""
 
     def __init__(self, scene: Scene, chain: VirtualKinematicChain, task: Task) -> None:
-        self.scene, self.chain, self.spans = scene, chain, find_phase_spans(task)
+        self.scene = scene
+        self.chain = chain
+        self.spans = find_phase_spans(task)
 
     def resolve_coordinate(self, name: str) -> Value:
         """Return a coordinate of the scene as a column of the chain or a constant."""
@@ -70,6 +82,12 @@ class _FrameLocator:
         placed = self.scene.objects[owner]
         return Value(None, float(placed.state[placed.object.coordinates.index(joint)]))
 
+    def locate_frames(
+        self, frames: Sequence[str], number: int, waypoint: int
+    ) -> tuple[FrameLocation, ...]:
+        """Return the locations of frames at a waypoint of phase `number`."""
+        return tuple(self.locate_frame(frame, number, waypoint) for frame in frames)
+
     def locate_frame(self, frame: str, number: int, waypoint: int) -> FrameLocation:
         """Return the location of a frame at a waypoint of phase `number`."""
         owner, dot, link = frame.partition(".")
@@ -77,14 +95,15 @@ class _FrameLocator:
         if not dot or owner not in self.scene.objects:
             return self._locate_on_chain(waypoint, self.chain.frame(frame, opening=phase.opening))
         placed = self.scene.objects[owner]
-        if not placed.object.free:  # independent of holds: if it is held, the chain is closed
+        if not placed.object.free:  # independent of holds: if it is grasped, the chain is closed
             return self._locate_in_tree(placed, link, waypoint)
-        hold = next((hold for hold in phase.held if hold.object == owner), None)
-        if hold is None and owner in phase.released_by:  # it is where the hand released it
-            hold, last = phase.released_by[owner]
-            waypoint = self.spans[last][2]
-        if hold is not None:
-            return self._locate_on_chain(waypoint, self.chain.frame(link, hold))
+        for hold in phase.held:
+            if hold.object == owner:
+                return self._locate_on_chain(waypoint, self.chain.frame(link, hold))
+        if owner in phase.released_by:  # it is where the hand released it
+            hold, last_phase = phase.released_by[owner]
+            _, _, release = self.spans[last_phase]
+            return self._locate_on_chain(release, self.chain.frame(link, hold))
         resting = phase.resting.get(owner, placed.placement)
         placement = resting * placed.object.link_placement(link, placed.state)
         return FrameLocation(_flatten_placement(placement))
@@ -92,12 +111,13 @@ class _FrameLocator:
     def _locate_in_tree(self, placed: PlacedObject, link: str, waypoint: int) -> FrameLocation:
         model = placed.object.model
         frame = model.frames[model.getFrameId(link, pin.FrameType.BODY)]
-        names = [f"{placed.name}.{name}" for name in placed.object.coordinates.names]
-        values = tuple(map(self.resolve_coordinate, names))
-        tree = Tree(model.saveToString(), _flatten_placement(placed.placement), values)
+        values = []
+        for name in placed.object.coordinates.names:
+            values.append(self.resolve_coordinate(f"{placed.name}.{name}"))
+        tree = Tree(model.saveToString(), _flatten_placement(placed.placement), tuple(values))
         moves = frame.parentJoint > 0 and any(value.column is not None for value in values)
-        at, local = waypoint if moves else -1, _flatten_placement(frame.placement)
-        return FrameLocation(local, frame.parentJoint, at, tree)
+        local = _flatten_placement(frame.placement)
+        return FrameLocation(local, frame.parentJoint, waypoint if moves else -1, tree)
 
     def _locate_on_chain(self, waypoint: int, at: tuple[int, pin.SE3]) -> FrameLocation:
         joint, local = at
@@ -118,22 +138,30 @@ class TermEvaluator:
     """
 
     def __init__(self, terms: Sequence[Term], transcription: Transcription, start: Floats) -> None:
-        self.terms, self.transcription, self.start = terms, transcription, start
-        rows, bounds, scales = [np.zeros(0, int)], [np.zeros((0, 2))], [np.zeros(0)]
-        timed, names = [np.zeros(0, bool)], []
-        for term, at in zip(terms, transcription.term_rows, strict=True):
+        self.terms = terms
+        self.transcription = transcription
+        self.start = start
+        # Concatenation needs at least one part each.
+        rows = [np.zeros(0, int)]
+        bounds = [np.zeros((0, 2))]
+        scales = [np.zeros(0)]
+        timed = [np.zeros(0, bool)]
+        names = []
+        for term, rows_by_waypoint in zip(terms, transcription.term_rows, strict=True):
             if isinstance(term, Cost):
                 continue
-            for own in at.values():
-                rows.append(own)
-                bounds.append(np.column_stack(term.compute_bounds(len(own))))
-                scales.append(np.full(len(own), _TOLERANCE_SCALE / term.tolerance))
-                timed.append(np.full(len(own), term.formula.uses_time_step))
-                names += [term.name] * len(own)
+            for own_rows in rows_by_waypoint.values():
+                count = len(own_rows)
+                rows.append(own_rows)
+                bounds.append(np.column_stack(term.compute_bounds(count)))
+                scales.append(np.full(count, _TOLERANCE_SCALE / term.tolerance))
+                timed.append(np.full(count, term.formula.uses_time_step))
+                names += [term.name] * count
         order = np.argsort(np.concatenate(rows))
         self.rows = np.concatenate(rows)[order]
         self.lower, self.upper = np.concatenate(bounds)[order].T
-        self.scale, self._timed = np.concatenate(scales)[order], np.concatenate(timed)[order]
+        self.scale = np.concatenate(scales)[order]
+        self._timed = np.concatenate(timed)[order]
         self._names = [names[k] for k in order]
 
     def compute_violation(self, z: Floats, dt: Floats) -> float:
@@ -142,7 +170,10 @@ class TermEvaluator:
 
     def compute_cost(self, z: Floats, dt: Floats) -> float:
         """Return the weighted sum of all costs."""
-        return float(self._evaluate(z, dt)[2]) if self.terms else 0.0
+        if not self.terms:
+            return 0.0
+        _, _, cost, _ = self._evaluate(z, dt)
+        return cost
 
     def lengthen_steps(self, z: Floats, dt: Floats, runs: Sequence[tuple[int, int]]) -> Floats:
         """Return step durations that satisfy the time-dependent constraints, as far as possible.
@@ -153,15 +184,20 @@ class TermEvaluator:
         waypoint = t.row_waypoints[self.rows - t.first_relaxed_row]  # counted from 0
         for begin, end in runs:
             depends_on_time = self._timed & (waypoint >= begin) & (waypoint < end)
-            best, least = 1.0, np.inf
-            trial, factor = dt.copy(), 1.0
-            while depends_on_time.any() and factor <= _MAX_STRETCH and least > _TOLERANCE_SCALE:
+            if not depends_on_time.any():
+                continue
+            best_factor = 1.0
+            least_excess = np.inf
+            trial = dt.copy()
+            factor = 1.0
+            while factor <= _MAX_STRETCH and least_excess > _TOLERANCE_SCALE:
                 trial[begin:end] = factor * dt[begin:end]
                 excess = float(self._compute_excess(z, trial)[depends_on_time].max())
-                if excess < least * (1.0 - 1e-3):
-                    best, least = factor, excess
+                if excess < least_excess * (1.0 - 1e-3):
+                    best_factor = factor
+                    least_excess = excess
                 factor *= _STRETCH_FACTOR
-            dt = np.concatenate([dt[:begin], best * dt[begin:end], dt[end:]])
+            dt = np.concatenate([dt[:begin], best_factor * dt[begin:end], dt[end:]])
         return dt
 
     def check(self, z: Floats, dt: Floats) -> None:
@@ -169,10 +205,11 @@ class TermEvaluator:
         if not self.terms:
             return
         values, jacobian, cost, gradient = self._evaluate(z, dt)
-        row, _ = jacobian.sparsity().get_triplet()
-        undefined_rows = ~np.isfinite(values)
-        undefined_rows[np.array(row, int)[~np.isfinite(jacobian.nonzeros())]] = True
-        names = {name for name, bad in zip(self._names, undefined_rows, strict=True) if bad}
+        rows_of_nonzeros, _ = jacobian.sparsity().get_triplet()
+        undefined_nonzeros = ~np.isfinite(jacobian.nonzeros())
+        is_undefined = ~np.isfinite(values)
+        is_undefined[np.array(rows_of_nonzeros, int)[undefined_nonzeros]] = True
+        names = {self._names[row] for row in np.flatnonzero(is_undefined)}
         if not (np.isfinite(cost) and np.isfinite(gradient).all()):
             names |= {term.name for term in self.terms if isinstance(term, Cost)}
         if names:
@@ -186,11 +223,13 @@ class TermEvaluator:
     def _compute_excess(self, z: Floats, dt: Floats) -> Floats:
         if not len(self.rows):
             return np.zeros(0)
-        values = self._evaluate(z, dt)[0]
-        excess = np.maximum(np.maximum(self.lower - values, values - self.upper), 0.0) * self.scale
+        values, _, _, _ = self._evaluate(z, dt)
+        beyond_bounds = np.maximum(self.lower - values, values - self.upper)
+        excess = np.maximum(beyond_bounds, 0.0) * self.scale
         return np.where(np.isnan(excess), np.inf, excess)
 
     def _evaluate(self, z: Floats, dt: Floats) -> tuple[Floats, Any, float, Any]:
+        """Return values and Jacobian of the constraints, and sum and gradient of the costs."""
         x = self.transcription.pack(z)
         values, jacobian, cost, gradient = self.transcription.term_values(x, self.start, dt)
         return np.asarray(values).ravel(), jacobian, float(cost), np.asarray(gradient.nonzeros())

@@ -83,10 +83,14 @@ class TermRow:
         keys share a function.
         """
         uses_previous = self.formula.uses_previous
-        frames = (*at.now, *(at.before if uses_previous else ()))
+        frames = at.now
+        if uses_previous:
+            frames += at.before
         involved = {frame.waypoint for frame in frames if frame.waypoint >= 0}
         if any(value.column is not None for value in self.values):
-            involved |= {at.waypoint, at.waypoint - 1} if uses_previous else {at.waypoint}
+            involved.add(at.waypoint)
+            if uses_previous:
+                involved.add(at.waypoint - 1)
         waypoints = tuple(sorted(involved))
 
         def position(waypoint: int) -> int:
@@ -119,31 +123,38 @@ class TermFunctions:
         waypoints: int,
         cache: Cache,
     ) -> None:
-        n, formula = Coordinates(model).size, row.formula
-        z, dt = ca.SX.sym("z", n * waypoints), ca.SX.sym("dt")
+        n = Coordinates(model).size
+        formula = row.formula
+        z = ca.SX.sym("z", n * waypoints)
+        dt = ca.SX.sym("dt")
         multipliers = ca.SX.sym("lam", formula.rows)
         points = ca.vertsplit(z, n) if waypoints else []
-        chain: dict[int, Any] = {}
+        placements_by_waypoint: dict[int, Any] = {}
 
-        def column(frame: FrameLocation) -> Any:
+        def build_placement(frame: FrameLocation) -> Any:
+            """Return the placement of a frame in the world, 12 numbers."""
             local = _to_matrix(ca.DM(frame.local))
             if frame.tree is not None:
-                return _to_column(_place_in_tree(frame, frame.tree, points, cache) @ local)
+                joint = _place_in_tree(frame, frame.tree, points, cache)
+                return _to_column(joint @ local)
             if frame.joint == 0:
                 return ca.DM(frame.local)
-            if frame.waypoint not in chain:
+            if frame.waypoint not in placements_by_waypoint:
                 kinematics = get_kinematics(model, cache)
-                chain[frame.waypoint] = kinematics.build_placements(points[frame.waypoint])
-            return _to_column(_to_matrix(chain[frame.waypoint][:, frame.joint - 1]) @ local)
+                placements = kinematics.build_placements(points[frame.waypoint])
+                placements_by_waypoint[frame.waypoint] = placements
+            joint = _to_matrix(placements_by_waypoint[frame.waypoint][:, frame.joint - 1])
+            return _to_column(joint @ local)
 
         inputs = []
         for frames, position in ((at.now, at.waypoint), (at.before, before)):
-            inputs += [column(frame) for frame in frames]
+            inputs += [build_placement(frame) for frame in frames]
             inputs += [_get_value(value, points, position) for value in row.values]
         value = formula.function(ca.vertcat(*inputs, dt))
         jacobian = ca.jacobian(value, z)
         hessian = ca.triu(ca.hessian(ca.dot(multipliers, value), z)[0])
-        slopes, curvatures = (ca.vertcat(*part.nonzeros()) for part in (jacobian, hessian))
+        slopes = ca.vertcat(*jacobian.nonzeros())
+        curvatures = ca.vertcat(*hessian.nonzeros())
         options = {"cse": True}
         self.value = ca.Function("term", [z, dt], [value], options)
         self.jacobian = ca.Function("term_jacobian", [z, dt], [slopes], options)
@@ -154,7 +165,9 @@ class TermFunctions:
 
 
 def _get_value(value: Value, points: list[Any], waypoint: int) -> Any:
-    return ca.SX(value.number) if value.column is None else points[waypoint][value.column]
+    if value.column is None:
+        return ca.SX(value.number)
+    return points[waypoint][value.column]
 
 
 def _place_in_tree(frame: FrameLocation, tree: Tree, points: list[Any], cache: Cache) -> Any:
@@ -210,49 +223,55 @@ class TermProgram:
             cache: Cache of the functions.
             width: Number of variables per waypoint, z first.
         """
-        self._n, self._width = z.shape[0], width
+        self._n = z.shape[0]
+        self._width = width
         self._size = (z.shape[1] - 1) * width
         self._hessians: list[tuple[ca.Function, list[Any], Ints, Ints, Any]] = []
-        self.rows, self.rows_by_waypoint = 0, [dict[int, Ints]() for _ in terms]
-        text = model.saveToString()
+        self.rows = 0
+        self.rows_by_waypoint = [dict[int, Ints]() for _ in terms]
+        model_text = model.saveToString()
         self.cost: Any = ca.MX(0)
         values = [ca.MX(0, 1)]
-        # nonzeros and positions of constraint Jacobian, cost gradient and cost Hessian
-        jacobians, gradients, curvatures = (list[tuple[Any, Ints]]() for _ in range(3))
+        # nonzeros and positions of each kind of waypoint
+        jacobians = list[tuple[Any, Ints]]()
+        gradients = list[tuple[Any, Ints]]()
+        curvatures = list[tuple[Any, Ints]]()
         row_waypoints = [np.zeros(0, int)]
-        for term, rows_at in zip(terms, self.rows_by_waypoint, strict=True):
-            kinds: dict[tuple[TermLocation, int], list[tuple[int, tuple[int, ...]]]] = {}
-            for at in term.locations:
-                waypoints, kind = term.kind(at)
-                kinds.setdefault(kind, []).append((at.waypoint, waypoints))
-            for (at, before), locations in kinds.items():
-                arguments = (term, at, before, len(locations[0][1]))
-                key = ("term", text, term.formula, term.values, *arguments[1:])
+        for term, rows_by_waypoint in zip(terms, self.rows_by_waypoint, strict=True):
+            for (at, before), locations in _group_by_kind(term).items():
+                waypoint_count = len(locations[0][1])
+                key = ("term", model_text, term.formula, term.values, at, before, waypoint_count)
                 functions = cache.get(
-                    key, functools.partial(TermFunctions, model, *arguments, cache)
+                    key,
+                    functools.partial(
+                        TermFunctions, model, term, at, before, waypoint_count, cache
+                    ),
                 )
                 involved = np.array([waypoints for _, waypoints in locations])
                 steps = np.array([waypoint - 1 for waypoint, _ in locations])
-                points = ca.vertcat(*(z[:, columns.tolist()] for columns in involved.T))
+                points = ca.vertcat(*[z[:, columns.tolist()] for columns in involved.T])
                 inputs = [points, dt[steps.tolist()].T]
-                height, count = term.formula.rows, len(locations)
+                height = term.formula.rows
+                count = len(locations)
                 rows = self.rows + height * np.arange(count)[:, None] + np.arange(height)
                 value = ca.vec(functions.value.map(count)(*inputs))
                 row, column = functions.jacobian_pattern
-                variables = self._find_variables(involved, column)
                 slopes, positions = _select_variables(
-                    ca.vec(functions.jacobian.map(count)(*inputs)), rows[:, row].ravel(), variables
+                    ca.vec(functions.jacobian.map(count)(*inputs)),
+                    rows[:, row].ravel(),
+                    self._find_variables(involved, column),
                 )
                 hessian = (functions.hessian, inputs, involved)
                 if term.weight is None:
                     values.append(value)
                     jacobians.append((slopes, positions))
-                    rows_at.update(zip(steps + 1, rows, strict=True))
+                    rows_by_waypoint.update(zip(steps + 1, rows, strict=True))
                     row_waypoints.append(np.repeat(steps, height))
                     self._hessians.append((*hessian, rows, functions.hessian_pattern))
                     self.rows += height * count
                 else:
                     self.cost += term.weight * ca.sum1(value)
+                    # The gradient is a column: the Jacobian's columns become its rows.
                     positions = np.stack([positions[1], np.zeros_like(positions[1])])
                     gradients.append((term.weight * slopes, positions))
                     weights = ca.DM.ones(1, count) * term.weight
@@ -269,7 +288,8 @@ class TermProgram:
         """Return the upper triangle of the Hessian of multipliers·values."""
         parts = []
         for function, inputs, involved, rows, pattern in self._hessians:
-            own = ca.reshape(multipliers[rows.ravel().tolist()], *rows.shape[::-1])
+            count, height = rows.shape
+            own = ca.reshape(multipliers[rows.ravel().tolist()], height, count)
             parts.append(self._weight_hessians(function, inputs, involved, pattern, own))
         return _assemble(parts, self._size, self._size)
 
@@ -282,13 +302,28 @@ class TermProgram:
         multipliers: Any,
     ) -> tuple[Any, Ints]:
         """Return nonzeros and positions of the Hessians of all waypoints of a kind."""
-        part = ca.vec(function.map(len(involved))(*inputs, multipliers))
-        return _select_variables(part, *(self._find_variables(involved, k) for k in pattern))
+        nonzeros = ca.vec(function.map(len(involved))(*inputs, multipliers))
+        row, column = pattern
+        return _select_variables(
+            nonzeros, self._find_variables(involved, row), self._find_variables(involved, column)
+        )
 
     def _find_variables(self, involved: Ints, index: Ints) -> Ints:
         """Return the variables of entries `index` of z for all waypoints of a kind; -1: start."""
-        waypoint, coordinate = involved[:, index // self._n], index % self._n
+        waypoint = involved[:, index // self._n]
+        coordinate = index % self._n
         return np.where(waypoint > 0, (waypoint - 1) * self._width + coordinate, -1).ravel()
+
+
+def _group_by_kind(
+    term: TermRow,
+) -> dict[tuple[TermLocation, int], list[tuple[int, tuple[int, ...]]]]:
+    """Return kind of location → waypoint, and waypoints it depends on, of each location."""
+    kinds: dict[tuple[TermLocation, int], list[tuple[int, tuple[int, ...]]]] = {}
+    for at in term.locations:
+        waypoints, kind = term.kind(at)
+        kinds.setdefault(kind, []).append((at.waypoint, waypoints))
+    return kinds
 
 
 def _select_variables(nonzeros: Any, row: Ints, column: Ints) -> tuple[Any, Ints]:

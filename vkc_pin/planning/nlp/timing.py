@@ -13,7 +13,8 @@ from vkc_pin.utils.arrays import Floats
 
 # Factor by which a motion may be slowed down before rate limits become rows of the program.
 _MAX_STRETCH = 1.5
-_DURATION_MARGIN = 1.15  # Duration relative to the profile 3s² − 2s³ along the initial guess.
+_STRETCH_MARGIN = 1.001  # duration relative to the shortest one within the bounds
+_DURATION_MARGIN = 1.15  # duration relative to the profile 3s² − 2s³ along the initial guess
 
 Runs = Sequence[tuple[int, int]]
 
@@ -70,13 +71,14 @@ class Timing:
         acceleration_ratios = np.max(np.abs(second) / self.acceleration, axis=1)
         dt = self.dt.copy()
         for number, (begin, end) in enumerate(self.runs):
-            excess = max(
-                float(velocity_ratios[begin:end].max()),
-                float(np.sqrt(acceleration_ratios[begin + number : end + number + 1].max())),
-            )
-            dt[begin:end] = np.clip(
-                dt[begin:end] * excess * 1.001, dt[begin:end], _MAX_STRETCH * self.least[begin:end]
-            )
+            # A run of m steps has m + 1 changes. Steps that take k times as long have bounds k and
+            # k² times as large.
+            changes_of_run = slice(begin + number, end + number + 1)
+            by_velocity = float(velocity_ratios[begin:end].max())
+            by_acceleration = float(np.sqrt(acceleration_ratios[changes_of_run].max()))
+            factor = max(by_velocity, by_acceleration)
+            stretched = dt[begin:end] * factor * _STRETCH_MARGIN
+            dt[begin:end] = np.clip(stretched, dt[begin:end], _MAX_STRETCH * self.least[begin:end])
         return replace(self, dt=dt)
 
 
@@ -103,7 +105,9 @@ def compute_step_times(
     """
     velocity, acceleration = limits
     steps = np.abs(np.diff(path, axis=0))
-    times, least = np.full(len(steps), dt), np.zeros(len(steps)) if least is None else least
+    times = np.full(len(steps), dt)
+    if least is None:
+        least = np.zeros(len(steps))
     for first, last in runs:
         distance = steps[first:last].sum(axis=0)
         velocity_time = np.max(1.5 * distance / velocity)

@@ -55,9 +55,11 @@ class Transcription:
     """
 
     def __init__(self, structure: Structure, cache: Cache) -> None:
-        self.structure, self.cache = structure, cache
+        self.structure = structure
+        self.cache = cache
         self.n = Coordinates(structure.model).size
-        self.segments, self.slots = structure.segments, structure.slots
+        self.segments = structure.segments
+        self.slots = structure.slots
         self.width = self.n + self.slots + 1
         self.size = self.segments * self.width
         self.uncompiled_functions: list[MachineCode] = []
@@ -70,21 +72,27 @@ class Transcription:
     @property
     def nbytes(self) -> int:
         """Estimated size in memory [bytes]."""
-        return BYTES_PER_ENTRY * (self.jacobian.nnz() + self.hessian.nnz()) + sum(
-            solver.nbytes for solver in self.pose_solvers
-        )
+        nonzeros = self.jacobian.nnz() + self.hessian.nnz()
+        return BYTES_PER_ENTRY * nonzeros + sum(solver.nbytes for solver in self.pose_solvers)
 
     def _make_symbols(self) -> None:
-        n, N, K = self.n, self.segments, self.slots
-        joints, poses = self.structure.model.njoints - 1, max(len(self.structure.poses), 1)
+        n = self.n
+        N = self.segments
+        K = self.slots
+        joints = self.structure.model.njoints - 1
+        poses = max(len(self.structure.poses), 1)
         self.x = ca.MX.sym("x", self.size)
         self.waypoint_variables = ca.reshape(self.x, self.width, N)  # one column per waypoint
-        self.z, self.start = self.waypoint_variables[:n, :], ca.MX.sym("z0", n)
-        self.planes, self.offsets = ca.MX.sym("C", K * 12 * joints, N), ca.MX.sym("R", K, N)
+        self.z = self.waypoint_variables[:n, :]
+        self.start = ca.MX.sym("z0", n)
+        self.planes = ca.MX.sym("C", K * 12 * joints, N)
+        self.offsets = ca.MX.sym("R", K, N)
         self.targets = ca.MX.sym("W", 12, poses)
         self.pose_offsets = ca.MX.sym("D", POSE_OFFSET_SIZE * poses, N)
-        self.penalty, self.relaxation_weights = ca.MX.sym("rho"), ca.MX.sym("p", N)
-        self.gears, self.dt = ca.MX.sym("gear", N), ca.MX.sym("dt", N)
+        self.penalty = ca.MX.sym("rho")
+        self.relaxation_weights = ca.MX.sym("p", N)
+        self.gears = ca.MX.sym("gear", N)
+        self.dt = ca.MX.sym("dt", N)
 
     def parameter_vector(self, **values: Floats | float) -> Floats:
         """Return the parameters of the program.
@@ -122,15 +130,26 @@ class Transcription:
         return np.column_stack([z, slack, relaxations * np.ones(len(z))]).ravel()
 
     def _make_objective(self) -> None:
-        """Build the objective: weighted squared steps and changes, and the penalties."""
-        n, N = self.n, self.segments
+        """Build the objective: weighted squared steps and changes, and the penalties.
+
+        With the matrices D and E of `make_differences`, the steps S = D z + d z_0 and their changes
+        S' = E z + e z_0 (one column for each coordinate), weights w and v of their squares, and the
+        penalties ρ of slacks s and p of relaxation variables e,
+
+            f = Σ w S² + Σ v S'² + ρ Σ s + Σ_t p_t e_t
+            ∇_z f = 2 Dᵀ(w S) + 2 Eᵀ(v S')
+        """
+        n = self.n
+        N = self.segments
         self.first, self.second, self.start_first, self.start_second = make_differences(
             N, self.structure.stops
         )
         self.step_weights = ca.MX.sym("w", N, n)
         self.change_weights = ca.MX.sym("v", len(self.second), n)
-        costs = ca.vertcat(ca.repmat(self.penalty, self.slots, N), self.relaxation_weights.T)
-        self.f, gradient = ca.dot(costs, self.waypoint_variables[n:, :]), ca.MX(N, n)
+        slack_penalties = ca.repmat(self.penalty, self.slots, N)
+        penalties = ca.vertcat(slack_penalties, self.relaxation_weights.T)
+        self.f = ca.dot(penalties, self.waypoint_variables[n:, :])
+        gradient = ca.MX(N, n)
         for matrix, start, weights in (
             (self.first, self.start_first, self.step_weights),
             (self.second, self.start_second, self.change_weights),
@@ -138,50 +157,78 @@ class Transcription:
             difference = make_sparse(matrix) @ self.z.T + ca.DM(start) @ self.start.T
             self.f += ca.dot(weights, difference**2)
             gradient += 2 * make_sparse(matrix.T) @ (weights * difference)
-        self.gradient = ca.vec(ca.vertcat(gradient.T, costs))
-        positions, (by_steps, by_changes) = make_curvature([self.first, self.second])
-        at = np.stack(positions)[:, None, :] * self.width + np.arange(n)[:, None]
-        values = [ca.vec(by_steps @ self.step_weights + by_changes @ self.change_weights)]
-        self.objective_curvature = assemble(values, [at.reshape(2, -1)], self.size, self.size)
+        self.gradient = ca.vec(ca.vertcat(gradient.T, penalties))
+        # Coordinates do not mix: the same pairs of waypoints for each of the n coordinates.
+        (row, column), (by_steps, by_changes) = make_curvature([self.first, self.second])
+        coordinates = np.arange(n)[:, None]
+        rows = row * self.width + coordinates
+        columns = column * self.width + coordinates
+        at = np.stack([rows.ravel(), columns.ravel()])
+        curvature = by_steps @ self.step_weights + by_changes @ self.change_weights
+        self.objective_curvature = assemble([ca.vec(curvature)], [at], self.size, self.size)
 
     def _make_constraints(self) -> None:
-        """Build the rows of eqs. 2, 3, 6 and 7, their Jacobian and the Hessian of λᵀ·rows."""
-        N, K = self.segments, self.slots
+        """Build all rows but those of rates, their Jacobian and the Hessian of λᵀ·rows."""
+        self._make_waypoint_rows()
+        self.base_rows = np.zeros(0, int)
+        self.first_relaxed_row = self.rows  # these do not come from waypoint functions
+        self.row_waypoints = np.zeros(0, int)
+        self.remaining_rows = ca.MX(0, 1)
+        if not self.structure.rolling.is_omnidirectional:
+            self._append_rolling_rows()
+        self._append_clamping_rows()
+        self.term_rows: list[dict[int, Ints]] = []
+        if self.structure.terms:
+            self._append_term_rows()
+        self._relax_remaining_rows()
+
+    def _make_waypoint_rows(self) -> None:
+        """Build the rows of eqs. 2, 3, 6 and 7, waypoint by waypoint.
+
+        The rows of waypoint t begin with its K witness planes, followed by those of its poses. All
+        waypoints with the same poses are of one kind: one function, mapped over them.
+        """
+        N = self.segments
+        K = self.slots
         poses_at: list[tuple[int, ...]] = [() for _ in range(N)]
         for index, pose in enumerate(self.structure.poses):
             for waypoint in pose.waypoints:
                 poses_at[waypoint - 1] += (index,)
-        count = [K + sum(self.structure.poses[k].rows for k in poses) for poses in poses_at]
-        first_row = np.concatenate([[0], np.cumsum(count)])
+        row_counts = [K + sum(self.structure.poses[k].rows for k in poses) for poses in poses_at]
+        first_row = np.concatenate([[0], np.cumsum(row_counts)])
         self.rows = int(first_row[-1])
         self.slot_rows = first_row[:-1, None] + np.arange(K)
         self.pose_rows: list[dict[int, Ints]] = [{} for _ in self.structure.poses]
-        values, jacobians, hessians = [], [], []
-        value_rows, jacobian_at, hessian_at = [], [], []
         self.multipliers = ca.MX.sym("lam_g", self.rows)
+        values = []
+        value_rows = []
+        jacobians = []
+        jacobian_at = []
+        hessians = []
+        hessian_at = []
         for poses in sorted(set(poses_at)):
             at = [t for t in range(N) if poses_at[t] == poses]
-            kind = get_waypoint_functions(
-                self.structure.model, K, tuple(self.structure.poses[k] for k in poses), self.cache
-            )
+            pose_rows = tuple(self.structure.poses[k] for k in poses)
+            kind = get_waypoint_functions(self.structure.model, K, pose_rows, self.cache)
             self.uncompiled_functions += kind.use_machine_code(len(at))
-            targets = ca.vec(self.targets[:, list(poses)] if poses else self.targets[:, 0])
-            size = POSE_OFFSET_SIZE
-            offsets = [size * k + i for k in poses or (0,) for i in range(size)]
-            parts = (self.waypoint_variables, self.planes, self.offsets)
-            inputs = [part[:, at] for part in parts]
-            inputs += [ca.repmat(targets, 1, len(at)), self.pose_offsets[offsets, at]]
+            inputs = self._select_inputs(poses, at)
             rows = first_row[at][:, None] + np.arange(kind.rows)
             multipliers = ca.reshape(self.multipliers[rows.ravel().tolist()], kind.rows, len(at))
             values.append(ca.vec(kind.value.map(len(at))(*inputs)))
+            value_rows.append(rows.ravel())
             jacobians.append(ca.vec(kind.jacobian.map(len(at))(*inputs)))
             hessians.append(ca.vec(kind.hessian.map(len(at))(*inputs, multipliers)))
-            value_rows.append(rows.ravel())
-            first, offset = first_row[at][:, None], np.array(at)[:, None] * self.width
+
+            begin_row = first_row[at][:, None]
+            begin_column = np.array(at)[:, None] * self.width
             row, column = kind.jacobian_pattern
-            jacobian_at.append(np.stack([(first + row).ravel(), (offset + column).ravel()]))
+            jacobian_at.append(
+                np.stack([(begin_row + row).ravel(), (begin_column + column).ravel()])
+            )
             row, column = kind.hessian_pattern
-            hessian_at.append(np.stack([(offset + row).ravel(), (offset + column).ravel()]))
+            hessian_at.append(
+                np.stack([(begin_column + row).ravel(), (begin_column + column).ravel()])
+            )
             for t in at:
                 begin = first_row[t] + K
                 for index, height in zip(poses, kind.pose_rows, strict=True):
@@ -191,22 +238,30 @@ class Transcription:
         self.g = ca.vertcat(*values)[order.tolist()]
         self.jacobian = assemble(jacobians, jacobian_at, self.rows, self.size)
         self.hessian = assemble(hessians, hessian_at, self.size, self.size)
-        self.base_rows = np.zeros(0, int)
-        self.first_relaxed_row = self.rows  # these do not come from waypoint functions
-        self.row_waypoints, self.remaining_rows = np.zeros(0, int), ca.MX(0, 1)
-        if not self.structure.rolling.is_omnidirectional:
-            self._append_rolling_rows()
-        self._append_clamping_rows()
-        self.term_rows: list[dict[int, Ints]] = []
-        if self.structure.terms:
-            self._append_term_rows()
-        self._relax_remaining_rows()
+
+    def _select_inputs(self, poses: tuple[int, ...], at: list[int]) -> list[ca.MX]:
+        """Return the inputs of `WaypointFunctions` at waypoints (from 0), one column each.
+
+        Functions without poses take one unused target.
+        """
+        used = list(poses) or [0]
+        offset_rows = [POSE_OFFSET_SIZE * k + i for k in used for i in range(POSE_OFFSET_SIZE)]
+        targets = ca.vec(self.targets[:, used])
+        return [
+            self.waypoint_variables[:, at],
+            self.planes[:, at],
+            self.offsets[:, at],
+            ca.repmat(targets, 1, len(at)),
+            self.pose_offsets[offset_rows, at],
+        ]
 
     def _append_rows(self, values: ca.MX, jacobian: ca.MX, row_waypoints: Ints) -> ca.MX:
         """Append rows with their Jacobian and waypoints (from 0); return their multipliers."""
-        rows, self.row_waypoints = self.rows, np.concatenate([self.row_waypoints, row_waypoints])
+        rows = self.rows  # before these
+        self.row_waypoints = np.concatenate([self.row_waypoints, row_waypoints])
         self.remaining_rows = ca.vertcat(self.remaining_rows, values)
-        self.g, self.jacobian = ca.vertcat(self.g, values), ca.vertcat(self.jacobian, jacobian)
+        self.g = ca.vertcat(self.g, values)
+        self.jacobian = ca.vertcat(self.jacobian, jacobian)
         self.rows += values.numel()
         multipliers = ca.MX.sym("lam_g", self.rows)
         (self.hessian,) = ca.substitute([self.hessian], [self.multipliers], [multipliers[:rows]])
@@ -217,27 +272,34 @@ class Transcription:
         """Append the rolling rows of a wheeled base, step by step."""
         path = ca.horzcat(self.start, self.z)
         steps = StepRows(self.structure.rolling, path, self.gears, width=self.width)
-        self.steps, self.base_rows = steps, self.rows + np.arange(len(steps.waypoints))
+        self.steps = steps
+        self.base_rows = self.rows + np.arange(len(steps.waypoints))
         multipliers = self._append_rows(steps.values, steps.jacobian, steps.waypoints)
         self.hessian = self.hessian + steps.hessian(multipliers)
 
     def _append_clamping_rows(self) -> None:
         """Append z_t − z_{t−1} = 0 for clamped and ±(z_t − z_{t−1}) ≥ 0 for pushed coordinates."""
-        pushed = [
-            (t, c, sign) for c, begin, end, sign in self.structure.pushed for t in range(begin, end)
-        ]
-        steps = [(t, c, 1) for c, begin, end in self.structure.clamped for t in range(begin, end)]
-        self.pushed_rows = self.rows + len(steps) + np.arange(len(pushed))
-        if not (steps := steps + pushed):
+        # waypoint t, column and sign of each step from waypoint t to t + 1
+        steps = list[tuple[int, int, int]]()
+        for column, first, last in self.structure.clamped:
+            steps += [(t, column, 1) for t in range(first, last)]
+        clamped_count = len(steps)
+        for column, first, last, direction in self.structure.pushed:
+            steps += [(t, column, direction) for t in range(first, last)]
+        pushed_count = len(steps) - clamped_count
+        self.pushed_rows = self.rows + clamped_count + np.arange(pushed_count)
+        if not steps:
             return
-        difference = ca.DM(len(steps), self.n + self.size)  # the start's columns come first
-        for row, (t, column, sign) in enumerate(steps):  # from waypoint t to t + 1
-            difference[row, self.n + t * self.width + column] = sign
-            before = self.n + (t - 1) * self.width + column if t else column
-            difference[row, before] = -sign
-        start, variables = difference[:, : self.n], difference[:, self.n :]
-        values = start @ self.start + variables @ self.x
-        self._append_rows(values, variables, np.array([t for t, _, _ in steps]))
+        by_start = ca.DM(len(steps), self.n)
+        by_variables = ca.DM(len(steps), self.size)
+        for row, (t, column, sign) in enumerate(steps):
+            by_variables[row, t * self.width + column] = sign
+            if t > 0:
+                by_variables[row, (t - 1) * self.width + column] = -sign
+            else:
+                by_start[row, column] = -sign
+        values = by_start @ self.start + by_variables @ self.x
+        self._append_rows(values, by_variables, np.array([t for t, _, _ in steps]))
 
     def _append_term_rows(self) -> None:
         """Append the user-defined constraints and add the user-defined costs to the objective."""
@@ -250,15 +312,16 @@ class Transcription:
             self.cache,
             self.width,
         )
-        self.term_rows = [
-            {waypoint: self.rows + rows for waypoint, rows in at.items()}
-            for at in part.rows_by_waypoint
-        ]
+        for rows_by_waypoint in part.rows_by_waypoint:
+            self.term_rows.append(
+                {waypoint: self.rows + rows for waypoint, rows in rows_by_waypoint.items()}
+            )
         outputs = [part.values, part.jacobian, part.cost, part.gradient]
         self.term_values = ca.Function("terms", [self.x, self.start, self.dt], outputs)
         multipliers = self._append_rows(part.values, part.jacobian, part.row_waypoints)
         self.hessian = self.hessian + part.hessian(multipliers)
-        self.f, self.gradient = self.f + part.cost, self.gradient + part.gradient
+        self.f = self.f + part.cost
+        self.gradient = self.gradient + part.gradient
         self.objective_curvature = self.objective_curvature + part.cost_hessian
 
     def _relax_remaining_rows(self) -> None:
@@ -299,15 +362,18 @@ class Transcription:
 
     def _make_rates(self) -> None:
         """Build the matrices of eq. 5: velocities and accelerations per step."""
-        n, identity = self.n, ca.DM.eye(self.n)
-        # omits slacks and relaxation variables
+        n = self.n
+        identity = ca.DM.eye(n)
+        # of a waypoint's variables the coordinates, without slacks and relaxation variable
         select = ca.horzcat(identity, ca.DM(n, self.slots + 1))
-        parts = (self.first, self.second)
-        self.rate_matrix = ca.vertcat(*(ca.kron(make_sparse(part), select) for part in parts))
-        steps = find_change_steps(self.structure.stops, self.segments)
-        self.rate_waypoints = np.repeat([*range(self.segments), *steps], n)
-        starts = (self.start_first[:, None], self.start_second[:, None])
-        self.rate_start = ca.vertcat(*(ca.kron(make_sparse(part), identity) for part in starts))
+        steps = ca.kron(make_sparse(self.first), select)
+        changes = ca.kron(make_sparse(self.second), select)
+        self.rate_matrix = ca.vertcat(steps, changes)
+        steps_of_start = ca.kron(make_sparse(self.start_first[:, None]), identity)
+        changes_of_start = ca.kron(make_sparse(self.start_second[:, None]), identity)
+        self.rate_start = ca.vertcat(steps_of_start, changes_of_start)
+        change_steps = find_change_steps(self.structure.stops, self.segments)
+        self.rate_waypoints = np.repeat([*range(self.segments), *change_steps], n)
 
     def solver(self, *, rates: bool, options: dict[str, Any]) -> Ipopt:
         """Return an Ipopt solver of this program with the given options of CasADi's nlpsol.
@@ -319,13 +385,20 @@ class Transcription:
         return self.cache.get(key, lambda: self._make_solver(rates, options))
 
     def _make_solver(self, rates: bool, options: dict[str, Any]) -> Ipopt:
-        g, jacobian, multipliers = self.g, self.jacobian, self.multipliers
-        parameters, weight, n_rows = self.parameters, ca.MX.sym("lam_f"), self.rows
+        g = self.g
+        jacobian = self.jacobian
+        multipliers = self.multipliers
+        parameters = self.parameters
+        weight = ca.MX.sym("lam_f")
+        n_rows = self.rows
         hessian = weight * self.objective_curvature + self.hessian
         if rates:
-            g = ca.vertcat(g, self.rate_matrix @ self.x + self.rate_start @ self.start)
+            rate_rows = self.rate_matrix @ self.x + self.rate_start @ self.start
+            g = ca.vertcat(g, rate_rows)
             jacobian = ca.vertcat(jacobian, self.rate_matrix)
-            multipliers, excess = ca.MX.sym("lam", g.numel()), ca.MX.sym("r", g.numel() - n_rows)
+            multipliers = ca.MX.sym("lam", g.numel())
+            excess = ca.MX.sym("r", rate_rows.numel())
+            # Rates are linear: the Hessian stays the same.
             g, jacobian = self._subtract_relaxation(
                 g, jacobian, np.arange(n_rows, g.numel()), self.rate_waypoints, excess
             )
@@ -344,10 +417,11 @@ class Transcription:
 
 def transcribe(structure: Structure, cache: Cache) -> Transcription:
     """Return the program of `structure`, rebuilt if machine code has become available since."""
-    program = cache.get(key := ("program", structure.key), lambda: Transcription(structure, cache))
-    if not program.uncompiled_functions or not all(
-        code.try_load() for code in program.uncompiled_functions
-    ):
+    key = ("program", structure.key)
+    program = cache.get(key, lambda: Transcription(structure, cache))
+    if not program.uncompiled_functions:
+        return program
+    if not all(code.try_load() for code in program.uncompiled_functions):
         return program
     cache.evict(*key)
     cache.evict("ipopt", structure.key)

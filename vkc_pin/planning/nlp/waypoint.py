@@ -85,14 +85,29 @@ def get_waypoint_functions(
 
 
 class WaypointFunctions:
-    """SX functions of one kind of waypoint: model, number of witness planes, and pose goals."""
+    """SX functions of one kind of waypoint: model, number of witness planes, and pose goals.
+
+    The variables are z, the slacks s and the relaxation e of the waypoint. Its rows are the witness
+    planes C·vec(M(z)) − R + s, and for each pose goal `build_pose_rows` to the target relaxed by e.
+
+    Attributes:
+        value, jacobian, hessian: Rows, nonzeros of their Jacobian, and nonzeros of the upper
+            triangle of the Hessian of multipliers·rows, each one column.
+        jacobian_pattern, hessian_pattern: Their rows and columns.
+        pose_rows: Number of rows of each pose goal.
+        rows: Number of all rows.
+    """
 
     def __init__(
         self, model: pin.Model, slots: int, poses: tuple[PoseRow, ...], cache: Cache
     ) -> None:
-        n, joints = Coordinates(model).size, model.njoints - 1
-        z, s, relaxation = ca.SX.sym("z", n), ca.SX.sym("s", slots), ca.SX.sym("e")
-        planes, offsets = ca.SX.sym("C", slots, 12 * joints), ca.SX.sym("R", slots)
+        n = Coordinates(model).size
+        joints = model.njoints - 1
+        z = ca.SX.sym("z", n)
+        s = ca.SX.sym("s", slots)
+        relaxation = ca.SX.sym("e")
+        planes = ca.SX.sym("C", slots, 12 * joints)
+        offsets = ca.SX.sym("R", slots)
         targets = ca.SX.sym("W", 12, max(len(poses), 1))
         pose_offsets = ca.SX.sym("D", POSE_OFFSET_SIZE, max(len(poses), 1))
         key = ("sweep", model.saveToString(), slots)
@@ -104,7 +119,8 @@ class WaypointFunctions:
         parts = []
         for k, pose in enumerate(poses):
             target = relax_target(targets[:, k], pose_offsets[:, k], relaxation)
-            parts.append(build_pose_rows(pose.kind, *pose.build_placement(placements), target))
+            rotation, translation = pose.build_placement(placements)
+            parts.append(build_pose_rows(pose.kind, rotation, translation, target))
         pose_values = ca.vertcat(*parts) if parts else ca.SX(0, 1)
         self.pose_rows = [pose.rows for pose in poses]
         self.rows = slots + sum(self.pose_rows)
@@ -116,6 +132,8 @@ class WaypointFunctions:
         plane_jacobian = ca.horzcat(coordinate_jacobian, ca.SX.eye(slots), ca.SX(slots, 1))
         jacobian = ca.vertcat(plane_jacobian, ca.jacobian(pose_values, variables))
         record_evaluations()
+        # The planes' part of the Lagrangian is λᵀ(C·vec(M) − R + s), of which only w·vec(M) with
+        # w = Cᵀλ has second derivatives: their cost does not grow with the number of planes.
         w = ca.SX.sym("w", 12 * joints)
         lagrangian = ca.dot(w, stacked) + ca.dot(pose_multipliers, pose_values)
         hessian = ca.triu(ca.hessian(lagrangian, variables)[0])
@@ -165,9 +183,10 @@ class StepRows:
         self.rows = self._functions.value.size1_out(0)
         self._inputs = [ca.vertcat(path[:3, :-1], path[:3, 1:]), gears.T]
         steps = np.arange(self.segments)
-        columns = (steps[:, None, None] + [[-1], [0]]) * width + np.arange(3)
-        # columns of both poses in x; negative for the start, which is no variable
-        self._columns = columns.reshape(-1, 6)
+        # Columns of both poses in x; negative for the start, which is no variable.
+        columns_before = (steps[:, None] - 1) * width + np.arange(3)
+        columns_after = steps[:, None] * width + np.arange(3)
+        self._columns = np.hstack([columns_before, columns_after])
         self.waypoints = np.repeat(steps, self.rows)
         self.values = ca.vec(self._functions.value.map(self.segments)(*self._inputs))
         row, column = self._functions.jacobian_pattern
@@ -194,16 +213,27 @@ class StepRows:
 
     def bounds(self, dt: Floats | None) -> tuple[Floats, Floats]:
         """Return the bounds of the rows; `dt`, shape (N,) [s], limits wheel travel if given."""
-        travel = np.full(self.segments, np.inf) if dt is None else self.rolling.wheel_speed * dt
-        lower, upper = np.zeros((self.segments, self.rows)), np.zeros((self.segments, self.rows))
+        travel = np.full(self.segments, np.inf)
+        if dt is not None:
+            travel = self.rolling.wheel_speed * dt
+        lower = np.zeros((self.segments, self.rows))
+        upper = np.zeros((self.segments, self.rows))
         upper[:, 1:] = np.inf
         if self.rolling.has_wheel_limit:
-            lower[:, -2:], upper[:, -2:] = -travel[:, None], travel[:, None]
+            lower[:, -2:] = -travel[:, None]
+            upper[:, -2:] = travel[:, None]
         return lower.ravel(), upper.ravel()
 
 
 class _StepFunctions:
-    """SX functions of one step of a wheeled base, of both poses and the gear.
+    """SX functions of one step of a wheeled base, of both poses and the gear g.
+
+    With the displacements δx, δy, δθ and the mean heading h = (θ + θ⁺)/2, the step is an arc if its
+    chord is parallel to h. Its lateral and longitudinal displacements are
+
+        s = cos h·δy − sin h·δx,   c = cos h·δx + sin h·δy
+
+    and its rows s, g·c ∓ r·δθ and c ∓ b/2·δθ, see `StepRows`.
 
     Attributes:
         value, jacobian, hessian: Rows, nonzeros of their Jacobian, and nonzeros of the upper
@@ -219,9 +249,11 @@ class _StepFunctions:
         longitudinal = ca.cos(heading) * dx + ca.sin(heading) * dy
         rows = [ca.cos(heading) * dy - ca.sin(heading) * dx]
         if rolling.turning_radius:
-            rows += [gear * longitudinal + side * rolling.turning_radius * turn for side in (-1, 1)]
+            for side in (-1, 1):
+                rows.append(gear * longitudinal + side * rolling.turning_radius * turn)
         if rolling.has_wheel_limit:
-            rows += [longitudinal + side * rolling.track / 2 * turn for side in (-1, 1)]
+            for side in (-1, 1):
+                rows.append(longitudinal + side * rolling.track / 2 * turn)
         values = ca.vertcat(*rows)
         multipliers = ca.SX.sym("lam", len(rows))
         jacobian = ca.jacobian(values, poses)
@@ -230,7 +262,8 @@ class _StepFunctions:
         # mapped over the steps in another order.
         slopes = ca.vertcat(*jacobian.nonzeros())
         curvatures = ca.vertcat(*hessian.nonzeros())
-        inputs, options = [poses, gear], {"cse": True}
+        inputs = [poses, gear]
+        options = {"cse": True}
         self.value = ca.Function("roll", inputs, [values], options)
         self.jacobian = ca.Function("roll_jacobian", inputs, [slopes], options)
         self.hessian = ca.Function("roll_hessian", [*inputs, multipliers], [curvatures], options)
@@ -264,36 +297,44 @@ def _differentiate_planes(
     """
     forces: list[Any] = []
     moments: list[Any] = []
+    axes = [slice(0, 3), slice(3, 6), slice(6, 9)]  # columns of R in a placement
     for joint in range(model.njoints - 1):
-        block, placement = planes[:, 12 * joint : 12 * joint + 12], placements[:, joint]
-        columns = [(placement[3 * c : 3 * c + 3], block[:, 3 * c : 3 * c + 3]) for c in range(4)]
+        block = planes[:, 12 * joint : 12 * joint + 12]
+        placement = placements[:, joint]
         forces.append(block[:, 9:])
-        moments.append(sum(_cross_rows(point, force) for point, force in columns))
+        moment = 0
+        for part in (*axes, slice(9, 12)):
+            moment = moment + _cross_rows(placement[part], block[:, part])
+        moments.append(moment)
+    # Add those of the joints that a joint supports; parents come first.
     for joint in reversed(range(model.njoints - 1)):
         parent = model.parents[joint + 1] - 1
         if parent >= 0:
             forces[parent] += forces[joint]
             moments[parent] += moments[joint]
-    slopes, twists = [ca.SX(planes.shape[0], 1)] * coordinates.size, dict[tuple[int, int], Any]()
+    slopes = [ca.SX(planes.shape[0], 1)] * coordinates.size
+    twists = dict[tuple[int, int], Any]()
     for column, joint, *_ in coordinates.moves:
         placement = placements[:, joint - 1]
         derivative = ca.jacobian(placement, z[column])
-        axes = [slice(3 * c, 3 * c + 3) for c in range(3)]
+        # Each column r of R has r × dr = r × (ω × r) = ω − (r·ω) r; their sum is 2ω.
         turns = [ca.cross(placement[axis], derivative[axis]) for axis in axes]
         omega = sum(turns, ca.SX(3, 1)) / 2
         velocity = derivative[9:] - ca.cross(omega, placement[9:])
-        twist = twists[column, joint] = ca.vertcat(omega, velocity)
+        twist = ca.vertcat(omega, velocity)
+        twists[column, joint] = twist
         ancestors = [k for k in model.supports[joint] if (column, k) in twists and k != joint]
-        relative = twist - twists[column, ancestors[-1]] if ancestors else twist
-        slopes[column] = slopes[column] + (
-            moments[joint - 1] @ relative[:3] + forces[joint - 1] @ relative[3:]
-        )
+        relative = twist
+        if ancestors:
+            relative = twist - twists[column, ancestors[-1]]
+        slope = moments[joint - 1] @ relative[:3] + forces[joint - 1] @ relative[3:]
+        slopes[column] = slopes[column] + slope
     return ca.horzcat(*slopes)
 
 
 def _cross_rows(point: Any, rows: Any) -> Any:
     """Return the cross product of `point` with each of the K `rows`, shape (K, 3)."""
-    x, y, z = point[0], point[1], point[2]
+    x, y, z = ca.vertsplit(point)
     return ca.horzcat(
         y * rows[:, 2] - z * rows[:, 1],
         z * rows[:, 0] - x * rows[:, 2],

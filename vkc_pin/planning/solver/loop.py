@@ -43,7 +43,8 @@ NEARLY_FEASIBLE = 0.01
 PROGRESS_ROUNDS = 5
 PROGRESS = 0.7  # factor by which the infeasibility must decrease in these rounds
 # relative decrease of the objective that justifies further rounds, from a guess and a solution
-MIN_IMPROVEMENT, MIN_CONTINUED_IMPROVEMENT = 0.05, 0.01
+MIN_IMPROVEMENT = 0.05
+MIN_CONTINUED_IMPROVEMENT = 0.01
 
 Callback = Callable[[Iteration], None]
 
@@ -81,8 +82,10 @@ class _Loop:
     """State between rounds: iterate, timing, penalty weights and trust region."""
 
     def __init__(self, problem: TrajectoryProblem, guess: Floats, radius: Floats | None) -> None:
-        self.problem, z = problem, problem.clip(guess)
-        self.timing, self.rates = problem.timing_for(z), False
+        z = problem.clip(guess)
+        self.problem = problem
+        self.timing = problem.timing_for(z)
+        self.rates = False  # whether velocity and acceleration limits are constraints
         self.merit = Merit(problem.options.penalty)
         self.solution = Solution(z, self.timing.dt)
         self.subproblem = Subproblem(problem, self.solution)
@@ -93,70 +96,90 @@ class _Loop:
 
     def run(self, callback: Callback, rounds: int) -> None:
         """Run rounds until the trajectory is feasible and short, or progress stalls."""
-        solution, region, started = self.solution, self.region, time.perf_counter()
+        solution = self.solution
+        region = self.region
+        started = time.perf_counter()
         self._set_point(self._evaluate(solution.z))
-        reference, since = self._measure_total(), 0  # when rounds were last counted
+        reference = self._measure_total()  # when rounds were last counted
+        rounds_without_progress = 0
         best = float("inf")  # objective of the last feasible trajectory
         for _ in range(rounds):
             record_evaluations()
-            used, point = region.radius, self.point
-            shortfall, nearly = point.shortfall, point.is_nearly_feasible
+            radius = region.radius
+            point = self.point
+            was_nearly_feasible = point.is_nearly_feasible
+            lacked_clearance = point.shortfall.max() >= NEARLY_FEASIBLE
             step = self.subproblem.solve(
                 point.z,
                 point.contacts,
                 point.infeasibility,
                 self.merit,
                 self.timing,
-                used,
+                radius,
                 rates=self.rates,
             )
             trial = self._evaluate(step.z)
             size = np.abs(step.z - point.z).max(axis=1)
             predicted, actual, accepted = self._judge(step, trial)
-            solution.rounds += 1
-            row = Iteration(
-                round=solution.rounds,
-                iterations=solution.iterations,
-                objective=trial.objective,
-                clearance=trial.contacts.compute_clearance(),
-                shortfall=trial.contacts.compute_violation(),
-                pose_error=trial.pose_error,
-                step=float(size.max()),
-                radius=float(used.max()),
-                penalty=self.merit.weights["clearance"],
-                accepted=accepted,
-                time=time.perf_counter() - started,
-            )
-            solution.history.append(row)
+            row = self._record_round(trial, size, radius, accepted, started)
             callback(row)
+            converged = False
             if accepted:
-                last = point.objective if nearly else best
+                last = point.objective if was_nearly_feasible else best
                 self._accept(trial)
-                if converged := step.succeeded and self._is_feasible():
-                    best = row.objective
-                    solution.converged, solution.status = True, "converged"
-                    self.feasible = trial.z, solution.dt
-                    improved = best < (1.0 - self.improvement) * last
-                    if not improved or (size < ACTIVE_FRACTION * used).all():
-                        break
+                converged = step.succeeded and self._is_feasible()
+            if converged:
+                best = row.objective
+                solution.converged = True
+                solution.status = "converged"
+                self.feasible = (trial.z, solution.dt)
+                has_improved = best < (1.0 - self.improvement) * last
+                is_inside_region = (size < ACTIVE_FRACTION * radius).all()
+                if is_inside_region or not has_improved:
+                    break
             region.adapt(predicted, actual, size, accepted)
             # Near feasibility, rejected rounds are not counted: they shrink the radius, which ends
             # the loop by itself.
-            since += accepted or shortfall.max() >= NEARLY_FEASIBLE
+            if accepted or lacked_clearance:
+                rounds_without_progress += 1
             # The infeasibility may also grow, where the objective decreased instead.
-            total, shortfall = self._measure_total(), self.point.shortfall
-            if not PROGRESS * reference < total <= reference:
-                reference, since = total, 0
-            if since >= PROGRESS_ROUNDS:
+            total = self._measure_total()
+            is_similar = PROGRESS * reference < total <= reference
+            if not is_similar:
+                reference = total
+                rounds_without_progress = 0
+            if rounds_without_progress >= PROGRESS_ROUNDS:
                 break
             if accepted and not converged and self.point.is_nearly_feasible:
                 region.limit()
-            if region.has_stalled(size, shortfall):
+            if region.has_stalled(size, self.point.shortfall):
                 if not self._raise_penalties():
                     break
-            elif accepted and nearly and step.slack.max() > CLEARANCE_TOLERANCE:
+            elif accepted and was_nearly_feasible and step.slack.max() > CLEARANCE_TOLERANCE:
                 # A weight is too small if violations pay even according to the model.
                 self._increase_weights()
+
+    def _record_round(
+        self, trial: _Point, size: Floats, radius: Floats, accepted: bool, started: float
+    ) -> Iteration:
+        """Append a row to the history of the solution, and return it."""
+        solution = self.solution
+        solution.rounds += 1
+        row = Iteration(
+            round=solution.rounds,
+            iterations=solution.iterations,
+            objective=trial.objective,
+            clearance=trial.contacts.compute_clearance(),
+            shortfall=trial.contacts.compute_violation(),
+            pose_error=trial.pose_error,
+            step=float(size.max()),
+            radius=float(radius.max()),
+            penalty=self.merit.weights["clearance"],
+            accepted=accepted,
+            time=time.perf_counter() - started,
+        )
+        solution.history.append(row)
+        return row
 
     def _raise_penalties(self) -> bool:
         """Raise the weights of violated constraints near feasibility; return whether any rose."""
@@ -170,7 +193,8 @@ class _Loop:
         return self.merit.increase_weights(self.point.infeasibility, CLEARANCE_TOLERANCE)
 
     def _evaluate(self, z: Floats) -> _Point:
-        options, begin = self.problem.options, time.perf_counter()
+        options = self.problem.options
+        begin = time.perf_counter()
         at = self.problem.evaluate_contacts(
             z, reach=options.contact_reach, nearest=options.contact_slots
         )
@@ -180,16 +204,19 @@ class _Loop:
 
     def _make_point(self, z: Floats, at: Contacts, between: SegmentContacts) -> _Point:
         contacts = self.separation.replace_contacts(z, at, between.contacts)
-        return _Point(z, at, between, contacts, *self._measure(z, contacts))
+        infeasibility, objective, pose_error = self._measure(z, contacts)
+        return _Point(z, at, between, contacts, infeasibility, objective, pose_error)
 
     def _measure_total(self) -> float:
         """Return the sum of all violations of the iterate, whatever the directions of stretches."""
-        point, total = self.point, self.point.infeasibility.total
+        point = self.point
+        total = point.infeasibility.total
         if not self.separation.is_active:
             return total
-        every, t = merge_contacts(point.at, point.between.contacts), self.problem.transcription
-        nearest = compute_shortfalls(every, t.segments, t.slots)
-        return total + float(nearest.sum() - point.shortfall.sum())
+        t = self.problem.transcription
+        contacts = merge_contacts(point.at, point.between.contacts)
+        shortfalls = compute_shortfalls(contacts, t.segments, t.slots)
+        return total + float(shortfalls.sum() - point.shortfall.sum())
 
     def _set_point(self, point: _Point) -> None:
         """Make `point` the iterate, and choose how its penetrating stretches separate."""
@@ -202,38 +229,44 @@ class _Loop:
 
     def _measure(self, z: Floats, contacts: Contacts) -> tuple[Infeasibility, float, float]:
         """Return infeasibility, objective and pose error, which depend on the timing."""
-        return (
-            measure_infeasibility(self.problem, z, self.timing, contacts, rates=self.rates),
-            self.problem.objective(z, self.timing.dt),
-            self.problem.row_error(z, self.timing.dt),
+        infeasibility = measure_infeasibility(
+            self.problem, z, self.timing, contacts, rates=self.rates
         )
+        objective = self.problem.objective(z, self.timing.dt)
+        pose_error = self.problem.row_error(z, self.timing.dt)
+        return infeasibility, objective, pose_error
 
     def _judge(self, step: Step, trial: _Point) -> tuple[Floats, Floats, bool]:
         """Return predicted and actual penalty reduction per waypoint, and whether to accept.
+
+        The penalty of waypoint t is Σ_j ν_j v_jt over the kinds j of constraints. From the iterate
+        z to the trial z⁺, with the slacks s and relaxations e of the subproblem, the predicted and
+        the actual reduction of the merit φ are
+
+            f(z) − f(z⁺) + Σ_t (Σ_j ν_j v_jt(z) − ν_c s_t − e_t Σ_{j≠c} ν_j v_jt(z))
+            f(z) − f(z⁺) + Σ_t Σ_j ν_j (v_jt(z) − v_jt(z⁺))
 
         The trial's penalty is infinite where a pair newly passes through each other, once the poses
         are nearly feasible. Before, and as long as stretches penetrate, the waypoints do not
         describe a motion yet.
         """
-        point, merit = self.point, self.merit
-        expected = (
-            merit.weights["clearance"] * step.slack
-            + merit.compute_penalty(point.infeasibility, clearance=False) * step.relaxation
-        )
-        before, after = (
-            merit.compute_penalty(each.infeasibility, clearance=True) for each in (point, trial)
-        )
-        if (
-            not self.separation.is_active
-            and point.infeasibility.amounts["poses"].max() < NEARLY_FEASIBLE
-        ):
+        point = self.point
+        merit = self.merit
+        penalty_of_slack = merit.weights["clearance"] * step.slack
+        others = merit.compute_penalty(point.infeasibility, clearance=False)
+        expected = penalty_of_slack + others * step.relaxation
+        before = merit.compute_penalty(point.infeasibility, clearance=True)
+        after = merit.compute_penalty(trial.infeasibility, clearance=True)
+        are_poses_nearly_feasible = point.infeasibility.amounts["poses"].max() < NEARLY_FEASIBLE
+        if are_poses_nearly_feasible and not self.separation.is_active:
             for crossing in find_new_crossings(trial.between.crossings, point.between.crossings):
                 after[max(crossing.first - 1, 0) : crossing.last + 1] = np.inf
-        penalty, gain = float(before.sum()), point.objective - trial.objective
+        penalty = float(before.sum())
+        gain = point.objective - trial.objective
         accepted = is_step_acceptable(
-            gain + penalty - float(expected.sum()),
-            gain + penalty - float(after.sum()),
-            point.objective + penalty,
+            predicted=gain + penalty - float(expected.sum()),
+            actual=gain + penalty - float(after.sum()),
+            merit=point.objective + penalty,
         )
         return before - expected, before - after, accepted
 
@@ -243,20 +276,22 @@ class _Loop:
         pace = self.problem.pace(trial.z)
         is_too_fast = self.timing.compute_violation(*pace) > TOLERANCE
         self._set_point(trial)
-        trial, timing, self.solution.z = self.point, self.timing, trial.z
+        self.solution.z = trial.z
+        point = self.point  # the trial, or the same waypoints with other directions of stretches
+        last_timing = self.timing
         # Infeasible waypoints are a poor estimate of how long the motion takes.
         if was_infeasible and not self.rates:
-            self.timing = self.problem.timing_for(trial.z)
+            self.timing = self.problem.timing_for(point.z)
         # Before it is nearly clear, rate limits only cost time.
-        if trial.contacts.compute_violation() < NEARLY_FEASIBLE and is_too_fast:
+        if point.contacts.compute_violation() < NEARLY_FEASIBLE and is_too_fast:
             self.timing = self.timing.stretch(*pace)
             if not self.rates and self.timing.compute_violation(*pace) > TOLERANCE:
                 self.rates = True
                 self.subproblem.reset_multipliers()
-        if self.timing is not timing:
+        if self.timing is not last_timing:
             self.solution.dt = self.timing.dt
-            trial.infeasibility, trial.objective, trial.pose_error = self._measure(
-                trial.z, trial.contacts
+            point.infeasibility, point.objective, point.pose_error = self._measure(
+                point.z, point.contacts
             )
 
     def _is_feasible(self) -> bool:
@@ -301,9 +336,10 @@ def solve(
     if loop.feasible is not None:
         solution.z, solution.dt = loop.feasible
     elif solution.status not in STOP_STATUSES:
-        shortfall = problem.evaluate_contacts(
+        contacts = problem.evaluate_contacts(
             solution.z, reach=problem.options.largest_margin, nearest=1
-        ).compute_violation()
+        )
+        shortfall = contacts.compute_violation()
         solution.shortfall = shortfall if shortfall > NEARLY_FEASIBLE else 0.0
     solution.radius = loop.region.radius
     return solution

@@ -41,8 +41,9 @@ class _Stretch(NamedTuple):
     def is_at(self, contacts: Contacts, phases: Ints, bodies: Ints, margin: int) -> Bools:
         """Return which contacts are between its bodies, up to `margin` waypoints from it."""
         row = contacts.waypoint
-        near = (row >= self.first - margin) & (row <= self.last + margin)
-        return near & (phases == self.phase) & (bodies == self.bodies).all(axis=1)
+        is_near = (row >= self.first - margin) & (row <= self.last + margin)
+        is_between_bodies = (bodies == self.bodies).all(axis=1)
+        return is_near & (phases == self.phase) & is_between_bodies
 
 
 class Separation:
@@ -50,15 +51,20 @@ class Separation:
 
     Where a motion passes through a body, coal's normals point back before its middle and forward
     behind it, so that planes with these normals pull the waypoints apart instead of aside. Here one
-    direction n is chosen for the whole stretch. Its contacts have the distance in this direction,
-    min n·b − max n·a over the points of both bodies, until the stretch is free.
+    direction n is chosen for the whole stretch, fixed in the second body. Its contacts have the
+    distance in this direction over the points a and b of both bodies,
+
+        d_n = min n·b − max n·a ≤ d = max over all unit vectors v of d_v
+
+    until the stretch is free.
 
     Args:
         problem: Problem.
     """
 
     def __init__(self, problem: TrajectoryProblem) -> None:
-        self.problem, self.contacts = problem, problem.contacts
+        self.problem = problem
+        self.contacts = problem.contacts
         self._stretches: list[_Stretch] = []
         self._vertices: dict[tuple[int, int], Floats] = {}
         self._pairs: dict[_Key, Ints] = {}
@@ -77,7 +83,9 @@ class Separation:
             crossings: Pairs that pass through each other between waypoints.
         """
         self._stretches = []
-        for stretch in sorted(self._find_stretches(contacts, crossings), key=lambda s: -s.depth):
+        stretches = self._find_stretches(contacts, crossings)
+        stretches.sort(key=lambda stretch: -stretch.depth)
+        for stretch in stretches:
             # The displacement of a deeper one may have freed it.
             if not stretch.depth or self._penetrates(z, stretch):
                 direction, z = self._choose_direction(z, stretch)
@@ -95,10 +103,13 @@ class Separation:
             return merge_contacts(at, between)
         parts = []
         for part, margin in ((at, 0), (between, 1)):
-            phases, bodies = self._find_phases(part.waypoint), self._find_bodies(part.pair)
+            phases = self._find_phases(part.waypoint)
+            bodies = self._find_bodies(part.pair)
             covered = [stretch.is_at(part, phases, bodies, margin) for stretch in self._stretches]
             parts.append(part.select(np.flatnonzero(~np.any(covered, axis=0))))
-        return merge_contacts(*parts, *(self._make_contacts(z, each) for each in self._stretches))
+        for stretch in self._stretches:
+            parts.append(self._make_contacts(z, stretch))
+        return merge_contacts(*parts)
 
     def _find_stretches(self, contacts: Contacts, crossings: Iterable[Crossing]) -> list[_Stretch]:
         """Return the stretches in which normals oppose each other, or that end on another side.
@@ -106,43 +117,54 @@ class Separation:
         Bodies that may overlap have none.
         """
         deep = contacts.select(np.flatnonzero((contacts.distance < 0.0) & (contacts.margin > 0.0)))
-        overlaps, crossed = defaultdict[_Key, list[int]](list), defaultdict[_Key, set[int]](set)
-        phases, bodies = self._find_phases(deep.waypoint), self._find_bodies(deep.pair)
-        for number, (phase, (one, other)) in enumerate(
-            zip(phases.tolist(), bodies.tolist(), strict=True)
-        ):
+        phases = self._find_phases(deep.waypoint).tolist()
+        bodies = self._find_bodies(deep.pair).tolist()
+        overlaps = defaultdict[_Key, list[int]](list)  # indices of deep contacts
+        for number, (phase, (one, other)) in enumerate(zip(phases, bodies, strict=True)):
             overlaps[phase, (one, other)].append(number)
-        for crossing in crossings:
-            one, other = self._find_bodies(np.array([crossing.pair]))[0].tolist()
-            key = self.contacts.find_phase(crossing.first + 1), (one, other)
-            # Rows of z inside the crossing, or at both ends of its only segment.
-            inside = range(crossing.first, crossing.last) or (crossing.first - 1, crossing.first)
-            crossed[key] |= {row for row in inside if row >= 0}
+        crossed_rows = self._find_crossed_rows(crossings)
         found = []
-        for key in {**overlaps, **crossed}:
+        for key in {**overlaps, **crossed_rows}:
             own = deep.select(np.array(overlaps[key], int))
-            rows = np.array(sorted({*own.waypoint.tolist(), *crossed[key]}))
-            for part in np.split(rows, np.flatnonzero(np.diff(rows) > 2) + 1):
-                first, last = int(part[0]), int(part[-1])
-                overlap = own.select(
-                    np.flatnonzero((own.waypoint >= first) & (own.waypoint <= last))
-                )
-                normals, depth = overlap.normal, -overlap.distance
+            rows = np.array(sorted({*own.waypoint.tolist(), *crossed_rows[key]}))
+            # A single waypoint without overlap does not end a stretch.
+            gaps = np.flatnonzero(np.diff(rows) > 2) + 1
+            for part in np.split(rows, gaps):
+                first = int(part[0])
+                last = int(part[-1])
+                is_within = (own.waypoint >= first) & (own.waypoint <= last)
+                overlap = own.select(np.flatnonzero(is_within))
+                normals = overlap.normal
+                depth = -overlap.distance
                 opposes = depth.max(initial=0.0) > SHALLOW and (normals @ normals.T).min() < 0.0
-                if opposes or not crossed[key].isdisjoint(part.tolist()):
+                if opposes or not crossed_rows[key].isdisjoint(part.tolist()):
                     found.append(_Stretch(*key, first, last, normals, float(depth.sum())))
         return [stretch for stretch in found if len(self._get_pairs(stretch))]
 
+    def _find_crossed_rows(self, crossings: Iterable[Crossing]) -> defaultdict[_Key, set[int]]:
+        """Return the rows of z inside crossings, or at both ends of a crossing's only segment."""
+        crossed_rows = defaultdict[_Key, set[int]](set)
+        for crossing in crossings:
+            one, other = self._find_bodies(np.array([crossing.pair]))[0].tolist()
+            key = (self.contacts.find_phase(crossing.first + 1), (one, other))
+            rows = [*range(crossing.first, crossing.last)]
+            if not rows:
+                rows = [crossing.first - 1, crossing.first]
+            crossed_rows[key].update(row for row in rows if row >= 0)
+        return crossed_rows
+
     def _find_phases(self, rows: Ints) -> Ints:
+        """Return the phase of each row of z."""
         return self.contacts.find_phases(rows + 1)
 
     def _find_bodies(self, pairs: Ints) -> Ints:
+        """Return the bodies of pairs of geometries, see `_Stretch`."""
         joints = self.contacts.get_joints(pairs)
         return np.where(joints > 0, joints, -pairs)
 
     def _get_pairs(self, stretch: _Stretch) -> Ints:
         """Return geometries and number of each pair of the bodies with a margin, shape (P, 3)."""
-        key = stretch.phase, stretch.bodies
+        key = (stretch.phase, stretch.bodies)
         if key not in self._pairs:
             part = self.contacts.phases[stretch.phase]
             own = (self._find_bodies(part.pairs) == stretch.bodies).all(axis=1)
@@ -160,10 +182,14 @@ class Separation:
         """Return the contacts of a stretch in its direction."""
         rows = np.arange(stretch.first, stretch.last + 1)
         assert stretch.direction is not None
-        return self._measure(z[rows], stretch, np.tile(stretch.direction, (len(rows), 1)), rows)
+        directions = np.tile(stretch.direction, (len(rows), 1))
+        return self._measure(z[rows], stretch, directions, rows)
 
     def _measure(self, z: Floats, stretch: _Stretch, directions: Floats, rows: Ints) -> Contacts:
         """Return contacts of all pairs of a stretch's bodies in one direction per configuration.
+
+        The witness points are the points of the first shape furthest along n and of the second
+        furthest along −n.
 
         Args:
             z: Configurations, shape (B, n).
@@ -172,21 +198,27 @@ class Separation:
             rows: Waypoints of the contacts, shape (B,).
         """
         rotations, translations = self.contacts.compute_placements(z)
-        joint = max(stretch.bodies[1], 0)
-        normal = np.einsum("bij,bj->bi", rotations[:, joint], directions)
-        parts, part = [make_empty_contacts()], self.contacts.phases[stretch.phase]
+        second_joint = max(stretch.bodies[1], 0)
+        normal = np.einsum("bij,bj->bi", rotations[:, second_joint], directions)
+        part = self.contacts.phases[stretch.phase]
+
+        def find_support(geometry: int, sign: float) -> Floats:
+            """Return the point of a geometry furthest along ±n, in the world, shape (B, 3)."""
+            points = self._get_vertices(stretch.phase, geometry)
+            joint = part.joint[geometry]
+            local = sign * np.einsum("bij,bi->bj", rotations[:, joint], normal)
+            support = points[(local @ points.T).argmax(axis=1)]
+            turned = np.einsum("bij,bj->bi", rotations[:, joint], support)
+            return np.asarray(turned + translations[:, joint])
+
+        parts = [make_empty_contacts()]
         for first, second, number in self._get_pairs(stretch).tolist():
-            ends = []
-            for geometry, sign in ((first, 1.0), (second, -1.0)):
-                points, joint = self._get_vertices(stretch.phase, geometry), part.joint[geometry]
-                local = sign * np.einsum("bij,bi->bj", rotations[:, joint], normal)
-                support = points[(local @ points.T).argmax(axis=1)]
-                turned = np.einsum("bij,bj->bi", rotations[:, joint], support)
-                ends.append(turned + translations[:, joint])
-            distance = np.einsum("bi,bi->b", normal, ends[1] - ends[0])
+            a = find_support(first, 1.0)
+            b = find_support(second, -1.0)
+            distance = np.einsum("bi,bi->b", normal, b - a)
             pair = np.tile([first, second], (len(z), 1))
             margin = np.full(len(z), part.margins[number])
-            parts.append(Contacts(rows, pair, distance, margin, normal, *ends))
+            parts.append(Contacts(rows, pair, distance, margin, normal, a, b))
         return merge_contacts(*parts)
 
     def _get_vertices(self, phase: int, geometry: int) -> Floats:
@@ -210,24 +242,19 @@ class Separation:
         Returns:
             The direction, shape (3,), and z_1..z_N after the displacement.
         """
-        problem, part = self.problem, self.contacts.phases[stretch.phase]
+        problem = self.problem
         begin = problem.ends[stretch.phase - 1] if stretch.phase else 0
+        end = problem.ends[stretch.phase]
         first = max(stretch.first - 1, begin)
-        last = min(stretch.last + 1, problem.ends[stretch.phase] - 1)
+        last = min(stretch.last + 1, end - 1)
         rows = np.arange(first, last + 1)
-        middle = z[[(stretch.first + stretch.last) // 2]]
-        rotations, _ = self.contacts.compute_placements(middle)
-        frame = rotations[0, max(stretch.bodies[1], 0)]
-        axes = [stretch.normals]
-        for geometry in np.unique(self._get_pairs(stretch)[:, :2]).tolist():
-            box = (rotations[0, part.joint[geometry]] @ part.rotation[geometry]).T
-            axes += [box, -box]
-        candidates = _select_distinct(np.concatenate(axes) @ frame)
+        candidates = self._list_directions(z, stretch)
         count = len(candidates)
-        moved, waypoints = np.tile(z[rows], (count, 1)), np.tile(rows, count)
+        moved = np.tile(z[rows], (count, 1))
+        waypoints = np.tile(rows, count)
         directions = np.repeat(candidates, len(rows), axis=0)
         self._push(moved, waypoints, stretch, directions)
-        left = self.contacts.evaluate(
+        remaining = self.contacts.evaluate(
             moved,
             waypoints + 1,
             reach=problem.options.largest_margin,
@@ -235,20 +262,35 @@ class Separation:
         )
         own = self._measure(moved, stretch, directions, np.arange(len(moved)))
         violation = np.zeros(len(moved))
-        for found in (left, own):
+        for found in (remaining, own):
             np.add.at(violation, found.waypoint, np.maximum(found.margin - found.distance, 0.0))
         change = moved - np.tile(z[rows], (count, 1))
         detour = np.sqrt((problem.motion_cost.metric * change**2).sum(axis=1))
         moved = moved.reshape(count, len(rows), -1)
         total = violation.reshape(count, -1).sum(axis=1)
         total += self._measure_transition(problem.waypoints(z)[first], moved[:, 0], first + 1)
-        if last + 2 <= problem.ends[stretch.phase]:
+        if last + 2 <= end:
             total += self._measure_transition(z[last + 1], moved[:, -1], last + 2)
         merit = problem.options.penalty * total + 2.0 * detour.reshape(count, -1).max(axis=1)
         best = int(np.argmin(merit))
         z = z.copy()
         z[rows] = moved[best]
         return candidates[best], z
+
+    def _list_directions(self, z: Floats, stretch: _Stretch) -> Floats:
+        """Return candidate directions of a stretch in the frame of its second body, shape (D, 3).
+
+        They are coal's normals and the axes of the bodies' boxes at the middle of the stretch.
+        """
+        part = self.contacts.phases[stretch.phase]
+        middle = z[[(stretch.first + stretch.last) // 2]]
+        rotations, _ = self.contacts.compute_placements(middle)
+        axes = [stretch.normals]  # rows, in the world
+        for geometry in np.unique(self._get_pairs(stretch)[:, :2]).tolist():
+            box = (rotations[0, part.joint[geometry]] @ part.rotation[geometry]).T
+            axes += [box, -box]
+        second_body = rotations[0, max(stretch.bodies[1], 0)]
+        return _select_distinct(np.concatenate(axes) @ second_body)
 
     def _measure_transition(self, begin: Floats, ends: Floats, waypoint: int) -> Floats:
         """Return the largest violation in the segments from one configuration to others.
@@ -261,8 +303,8 @@ class Separation:
         Returns:
             Missing clearance, shape (B,) [m].
         """
-        share = (np.arange(TRANSITION_SAMPLES) + 0.5)[:, None] / TRANSITION_SAMPLES
-        states = (begin + share * (ends[:, None] - begin)).reshape(-1, len(begin))
+        s = (np.arange(TRANSITION_SAMPLES) + 0.5)[:, None] / TRANSITION_SAMPLES
+        states = (begin + s * (ends[:, None] - begin)).reshape(-1, len(begin))
         found = self.contacts.evaluate(
             states,
             np.full(len(states), waypoint),
@@ -272,17 +314,23 @@ class Separation:
         return found.compute_shortfall(len(states)).reshape(len(ends), -1).max(axis=1)
 
     def _push(self, z: Floats, rows: Ints, stretch: _Stretch, directions: Floats) -> None:
-        """Move configurations z, shape (B, n), until the deepest pair is apart in its direction."""
+        """Move configurations z, shape (B, n), until the deepest pair is apart in its direction.
+
+        With the gradient g of its distance d_n, zero for fixed coordinates, the least step that
+        adds the shortfall m − d_n of the margin m is δz = (m − d_n) g / (gᵀg).
+        """
         problem = self.problem
-        lower, upper = problem.lower[rows], problem.upper[rows]
+        lower = problem.lower[rows]
+        upper = problem.upper[rows]
         free = upper - lower > 1e-9
         for _ in range(PUSHES):
             found = self._measure(z, stretch, directions, np.arange(len(z)))
             found = found.select(np.flatnonzero(found.slot == 0))  # the largest violation
             gradient = self.contacts.compute_gradients(z, found)
-            growth = np.maximum(found.margin - found.distance, 0.0)
+            shortfall = np.maximum(found.margin - found.distance, 0.0)
             step = free * gradient
-            step *= (growth / np.maximum((step * gradient).sum(axis=1), 1e-6))[:, None]
+            squared_norm = (step * gradient).sum(axis=1)
+            step *= (shortfall / np.maximum(squared_norm, 1e-6))[:, None]
             size = np.abs(step).max(axis=1, keepdims=True)
             step *= np.minimum(1.0, MAX_PUSH / np.maximum(size, 1e-9))
             z[:] = np.clip(z + step, lower, upper)

@@ -73,7 +73,8 @@ class Subproblem:
     """
 
     def __init__(self, problem: TrajectoryProblem, solution: Solution) -> None:
-        self.problem, self.solution = problem, solution
+        self.problem = problem
+        self.solution = solution
         self._multipliers: dict[str, Any] = {}
 
     def reset_multipliers(self) -> None:
@@ -93,6 +94,13 @@ class Subproblem:
     ) -> Step:
         """Minimize the model of the merit function in the trust region.
 
+        The variables are waypoints x_t with |x_t − z_t| ≤ r_t, slacks s_t and relaxations e_t. To
+        the quadratic model of f (see `MotionCost.weights`) it adds the penalties
+
+            Σ_t (ν_c Σ_k s_tk + e_t Σ_{j≠c} ν_j v_jt(z))
+
+        The iterate z, with its shortfalls as slacks and e = 1, satisfies all rows.
+
         Args:
             z: Iterate z_1..z_N, shape (N, n).
             at: Contacts of the iterate.
@@ -102,23 +110,29 @@ class Subproblem:
             radius: Trust-region radius at each waypoint, shape (N,) [m] or [rad].
             rates: Whether velocity and acceleration limits are constraints.
         """
-        problem, t = self.problem, self.problem.transcription
+        problem = self.problem
+        t = problem.transcription
         begin = time.perf_counter()
         planes, offsets = problem.contacts.compute_planes(z, at, slots=t.slots)
         self.solution.timings["coal"] += time.perf_counter() - begin
         lower = np.maximum(problem.lower, z - radius[:, None])
         upper = np.minimum(problem.upper, z + radius[:, None])
-        lbg, ubg = problem.row_bounds(timing if rates else None)
-        relaxed = found.max_violation > TOLERANCE
+        lower_rows, upper_rows = problem.row_bounds(timing if rates else None)
+        is_relaxed = found.max_violation > TOLERANCE
         # While rows are relaxed, those of the last round differ and its solution need not be exact.
-        if relaxed:
+        if is_relaxed:
             self.reset_multipliers()
-        mode = _ROUGH if relaxed else _WARM if self._multipliers else {}
-        iterations = {"ipopt.max_iter": problem.options.max_iterations}
-        options = {**iterations, **make_linear_solver_options(), **_IPOPT, **mode}
+        options: dict[str, Any] = {"ipopt.max_iter": problem.options.max_iterations}
+        options.update(make_linear_solver_options())
+        options.update(_IPOPT)
+        if is_relaxed:
+            options.update(_ROUGH)
+        elif self._multipliers:
+            options.update(_WARM)
         solver = t.solver(rates=rates, options=options)
         penalties = merit.compute_penalty(found, clearance=False)
-        relaxation = np.where(relaxed & (penalties > 0.0), 1.0, 0.0)
+        # Waypoints without violation, and all once nothing is violated, must satisfy the rows.
+        max_relaxation = np.where(is_relaxed & (penalties > 0.0), 1.0, 0.0)
         parameters = t.parameter_vector(
             planes=planes,
             offsets=offsets,
@@ -134,11 +148,11 @@ class Subproblem:
         slack_limit = np.where(shortfall > 0.0, np.inf, 0.0)
         begin = time.perf_counter()
         result = solver(
-            x0=t.pack(z, shortfall, relaxation),
+            x0=t.pack(z, shortfall, max_relaxation),
             lbx=t.pack(lower),
-            ubx=t.pack(upper, slack_limit, relaxation),
-            lbg=lbg,
-            ubg=ubg,
+            ubx=t.pack(upper, slack_limit, max_relaxation),
+            lbg=lower_rows,
+            ubg=upper_rows,
             p=np.concatenate([parameters, found.rate_excess]),
             **self._multipliers,
         )

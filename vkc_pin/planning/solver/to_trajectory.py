@@ -40,8 +40,7 @@ def _list_rows(problem: TrajectoryProblem) -> tuple[Ints, list[PhaseSpan]]:
     last = task.phases[-1]
     if set(task.after) < {*last.held, *last.grasps}:
         rows.append(rows[-1])
-        span = len(rows) - 2, len(rows) - 1
-        phases.append(PhaseSpan("let go", *span, task.after, last.opening))
+        phases.append(PhaseSpan("let go", len(rows) - 2, len(rows) - 1, task.after, last.opening))
     return np.array(rows), phases
 
 
@@ -53,7 +52,7 @@ def close_chains(problem: TrajectoryProblem, points: Floats, at: Floats) -> Floa
     Args:
         problem: Problem that the trajectory solves.
         points: Configurations, shape (M, n).
-        at: Row of each, with the fraction of the way to the next one, shape (M,).
+        at: Row of each plus the fraction of the step to the next one, shape (M,).
 
     Returns:
         Configurations that satisfy eq. 2 where both adjacent waypoints do, shape (M, n).
@@ -92,7 +91,9 @@ def _hold_grasp_coordinates(problem: TrajectoryProblem, waypoints: Floats) -> No
         for phase, first, last in find_phase_spans(problem.task):
             active[first : last + 1] |= hold in phase.held
             active[last] |= hold in phase.grasps
-        at = np.flatnonzero(active)
-        nearest = at[np.minimum(np.searchsorted(at, np.arange(len(waypoints))), len(at) - 1)]
-        for column in map(problem.chain.index, names):
-            waypoints[:, column] = waypoints[nearest, column]
+        active_waypoints = np.flatnonzero(active)
+        following = np.searchsorted(active_waypoints, np.arange(len(waypoints)))
+        source = active_waypoints[np.minimum(following, len(active_waypoints) - 1)]
+        for name in names:
+            column = problem.chain.index(name)
+            waypoints[:, column] = waypoints[source, column]

@@ -13,7 +13,16 @@ FIRST_RADIUS = 0.5  # [m], [rad] initial radius, also after the penalty weights 
 # little inside its bounds)
 ACTIVE_FRACTION = 0.9
 SETTLE_RADIUS = 0.05  # [m], [rad] within which the planes approximate the distances well
+# ratio of actual to predicted reduction below which a prediction is poor, above which it is good
+POOR_RATIO = 0.25
+GOOD_RATIO = 0.7
 SHRINK = 0.4  # factor on the smaller of radius and step where the prediction was poor
+WIDEN = 1.5  # factor on a radius that limited the step where the prediction was good
+MIN_RADIUS = 1e-6  # [m], [rad]
+# ratio of actual to predicted reduction of the merit above which a step is accepted
+ACCEPTANCE_RATIO = 0.05
+# change relative to the merit, or to 1, that counts as none
+NEGLIGIBLE_MERIT_CHANGE = 1e-4
 # merit change in a block that is ignored: 8 mm of shortfall at the initial penalty weight
 NEGLIGIBLE_CHANGE = 0.4
 # [m] shortfall at a waypoint, clearance within segments, and steps (also [rad]) that are
@@ -43,6 +52,9 @@ class TrustRegion:
     def adapt(self, predicted: Floats, actual: Floats, step: Floats, accepted: bool) -> None:
         """Widen blocks in which the prediction was good, shrink those in which it was poor.
 
+        With the sums a of the actual and p of the predicted reductions of a block, it is good if a
+        > 0.7 p, and poor if a < p/4; changes below `NEGLIGIBLE_CHANGE` are neither.
+
         Args:
             predicted: Predicted penalty reduction at each waypoint, shape (N,).
             actual: Actual penalty reduction, shape (N,).
@@ -50,34 +62,41 @@ class TrustRegion:
             accepted: Whether the step was accepted.
         """
         blocks = int(self.block[-1]) + 1
-        gain, expected, size = np.zeros(blocks), np.zeros(blocks), np.zeros(blocks)
+        expected = np.zeros(blocks)
         np.add.at(expected, self.block, predicted)
+        gain = np.zeros(blocks)
         np.add.at(gain, self.block, actual)
+        size = np.zeros(blocks)
         np.maximum.at(size, self.block, step)
-        poor = (expected - gain > NEGLIGIBLE_CHANGE) & (gain < 0.25 * expected)
-        if not accepted and not poor.any():
-            poor[:] = True
-        radius = np.array([self.radius[self.block == b][0] for b in range(blocks)])
-        good = (gain > 0.7 * expected - NEGLIGIBLE_CHANGE) & (size > ACTIVE_FRACTION * radius)
-        widened = np.where(good & accepted, 1.5, 1.0) * radius
-        radius = np.where(poor, SHRINK * np.minimum(radius, size), widened)
-        self.radius = np.maximum(radius, 1e-6)[self.block]
+        first_waypoints = np.searchsorted(self.block, np.arange(blocks))
+        radius = self.radius[first_waypoints]
+
+        is_poor = (expected - gain > NEGLIGIBLE_CHANGE) & (gain < POOR_RATIO * expected)
+        if not accepted and not is_poor.any():
+            is_poor[:] = True
+        is_good = gain > GOOD_RATIO * expected - NEGLIGIBLE_CHANGE
+        is_limited = size > ACTIVE_FRACTION * radius
+        widened = np.where(is_good & is_limited & accepted, WIDEN, 1.0) * radius
+        shrunk = SHRINK * np.minimum(radius, size)
+        radius = np.where(is_poor, shrunk, widened)
+        self.radius = np.maximum(radius, MIN_RADIUS)[self.block]
 
     def limit(self) -> None:
         """Limit the radii to `SETTLE_RADIUS`."""
         self.radius = np.minimum(self.radius, SETTLE_RADIUS)
 
     def has_stalled(self, step: Floats, shortfall: Floats) -> bool:
-        """Return whether the waypoints that lack clearance, or else all, no longer move.
+        """Return whether the waypoints that lack clearance, if any, or else all no longer move.
 
         Args:
             step: Largest coordinate change at each waypoint, shape (N,) [m] or [rad].
             shortfall: Clearance violation at each waypoint, shape (N,) [m].
         """
-        violated = shortfall > CLEARANCE_TOLERANCE
-        if not violated.any():
-            violated[:] = True
-        return bool((np.minimum(self.radius, step)[violated] < CLEARANCE_TOLERANCE).all())
+        lacks_clearance = shortfall > CLEARANCE_TOLERANCE
+        if not lacks_clearance.any():
+            lacks_clearance[:] = True
+        moves = np.minimum(self.radius, step)
+        return bool((moves[lacks_clearance] < CLEARANCE_TOLERANCE).all())
 
     def reset(self) -> None:
         """Reset all radii to `FIRST_RADIUS`."""
@@ -92,7 +111,7 @@ def is_step_acceptable(predicted: float, actual: float, merit: float) -> bool:
         actual: Actual reduction.
         merit: Merit of the iterate.
     """
-    negligible = 1e-4 * max(1.0, abs(merit))
+    negligible = NEGLIGIBLE_MERIT_CHANGE * max(1.0, abs(merit))
     if predicted < negligible:
         return actual >= -negligible
-    return actual > 0.05 * predicted
+    return actual > ACCEPTANCE_RATIO * predicted

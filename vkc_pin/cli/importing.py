@@ -27,9 +27,7 @@ if TYPE_CHECKING:
 
 def add_importing(commands: Any) -> None:
     """Add the commands to those of a parser."""
-    about = (
-        "Import a robot from a URDF, xacro, MJCF or SDF file, and report all guesses."
-    )
+    about = "Import a robot from a URDF, xacro, MJCF or SDF file, and report all guesses."
     robot = add_command(commands, "import-robot", "import a robot", _import_robot, about)
     add_option(robot, "file FILE", "URDF, xacro, MJCF or SDF")
     _add_output(robot, "import-robot")

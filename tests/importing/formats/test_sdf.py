@@ -607,6 +607,21 @@ def test_followers_keep_the_limits_that_their_leaders_reach(
     assert found["to_other"] == (0.0, 1.0)
 
 
+def test_spaces_around_names_do_not_matter(tmp_path: Path) -> None:
+    content = '<link name="base"/>' + format_follower("first", "", (0.0, 0.4))
+    content += format_follower("second", " to_first ", (0.0, 0.4), multiplier=-1.0)
+    content = content.replace('joint name="to_first"', 'joint name=" to_first "')
+    text = f'<sdf version="1.11"><model name="m">{content}</model></sdf>'
+    found = {joint.name: joint.limits for joint in read_model(tmp_path, text).joints.values()}
+    assert found == {"to_first": (0.0, 0.4), "to_second": (-0.4, 0.0)}
+
+
+def test_links_take_no_names_from_elements_inside(tmp_path: Path) -> None:
+    text = '<sdf version="1.11"><model name="m"><link><name>l</name></link></model></sdf>'
+    with pytest.raises(InputError, match="a link without a name"):
+        read_model(tmp_path, text)
+
+
 @pytest.mark.parametrize(("radius", "length"), [(0.1, 0.3), (0.4, 0.05), (0.02, 1.0)])
 def test_cones_stand_on_their_base(tmp_path: Path, radius: float, length: float) -> None:
     cone = f"<cone><radius>{radius}</radius><length>{length}</length></cone>"

@@ -94,7 +94,7 @@ class _SdfJoint(NamedTuple):
     @property
     def name(self) -> str:
         """Name in its model."""
-        return self.element.get("name", "")
+        return _get_name(self.element)
 
 
 class _Reader:
@@ -181,7 +181,7 @@ class _Reader:
         for element in scope.element.findall("model"):
             inner = Scope(scope.file, element, scope.rules, scope)
             self._add(scope, scope.models, element, inner)
-            self._fill_inner_scope(inner, files, element.get("name", ""))
+            self._fill_inner_scope(inner, files, _get_name(element))
         for include in scope.element.findall("include"):
             self._include(scope, include, files)
         for tag in ("actor", "population", "road", "state"):
@@ -212,7 +212,7 @@ class _Reader:
         self, scope: Scope, elements: dict[str, Any], element: ElementTree.Element, item: Any
     ) -> None:
         """Add an item by the name of an element, which must be unique."""
-        name = (element.get("name") or element.findtext("name") or "").strip()
+        name = _get_name(element)
         if not name:
             problem = f"a {element.tag} without a name"
             raise make_element_error(scope.file, element, problem, expected="a name")
@@ -245,8 +245,7 @@ class _Reader:
             return
         named = include if include.findtext("name") else models[0]
         self._add(scope, scope.models, named, inner)
-        name = (named.findtext("name") or named.get("name") or "").strip()
-        self._fill_inner_scope(inner, files, name)
+        self._fill_inner_scope(inner, files, _get_name(named))
 
     # The tree
 
@@ -509,7 +508,7 @@ class _Reader:
         self, scope: Scope, joint: ElementTree.Element, mimic: ElementTree.Element
     ) -> Coupling:
         """Return the coupling y = factor · (x − reference) + offset of a joint, by full names."""
-        name = joint.get("name", "")
+        name = _get_name(joint)
         (factor,) = scope.read_numbers(mimic, "multiplier", 1, "1", name)
         (offset,) = scope.read_numbers(mimic, "offset", 1, "0", name)
         (reference,) = scope.read_numbers(mimic, "reference", 1, "0", name)
@@ -521,7 +520,7 @@ class _Reader:
         self, scope: Scope, joint: ElementTree.Element, element: ElementTree.Element
     ) -> Any:
         """Return the unit axis in the joint's frame, shape (3,)."""
-        name = joint.get("name", "")
+        name = _get_name(joint)
         xyz = element.find("xyz")
         axis = np.array(scope.read_numbers(element, "xyz", 3, "0 0 1", name))
         if not np.linalg.norm(axis) > 0.0:
@@ -778,6 +777,12 @@ def _read_any_number(
 def _read_rate_limit(stated: float) -> float | None:
     """Return a velocity or effort limit, or None for numbers that mean none."""
     return stated if MIN_POSITIVE <= stated < MAX_COORDINATE else None
+
+
+def _get_name(element: ElementTree.Element) -> str:
+    """Return the name of an element; an <include> states it in an element of its own."""
+    stated = element.findtext("name") if element.tag == "include" else element.get("name")
+    return (stated or "").strip()
 
 
 def _note_other_versions(

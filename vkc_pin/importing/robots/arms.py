@@ -404,6 +404,8 @@ def _has_jaw_beside(palm: Body, jaw: Body, file: UrdfFile) -> bool:
     number = full.getJointId(jaw.name)
     base = data.oMi[number]
     motion = np.asarray(data.joints[number].S, float).ravel()
+    if motion.size != 6:  # a free body, no jaw
+        return False
     # It is zero for a jaw that slides.
     axis = base.rotation @ motion[3:]
     ahead = np.vstack(of_jaw) - base.translation

@@ -18,6 +18,8 @@ JointKind = Literal["revolute", "prismatic"]
 _FIXED = "fixed"
 _DECISIVE = 10.0
 """Difference of two BIC that counts as very strong evidence (Kass and Raftery, JASA 1995)."""
+_LARGEST_RADIUS = 2.0  # [m] of a hinge
+_DOUBT = 3.0  # standard deviations up to which a rotation may be there
 _FEWEST_POSES = 4
 _SHARED = 10  # parameters that all poses share: 6 of the link, 2 of the direction, 2 of the point
 _STEP = 1e-6  # of finite differences [m], [rad]
@@ -37,8 +39,8 @@ class JointEstimate:
         axis_deviation: Standard deviation of the direction, per component across it [rad].
         point_deviation: Standard deviation of the point, per component across the axis [m]; 0 for
             a slide.
-        information: Bayesian information criterion of each kind, "fixed" included; the least one
-            is the kind of the joint.
+        information: Bayesian information criterion of each kind, "fixed" included: the less, the
+            more plausible.
     """
 
     kind: JointKind
@@ -66,9 +68,10 @@ def estimate_joint(
 ) -> JointEstimate:
     """Estimate a hinge or a slide from measured poses of the link that it moves.
 
-    Both kinds are fitted by least squares, and the Bayesian information criterion chooses between
-    them, as in Sturm, Stachniss and Burgard, *A probabilistic framework for learning kinematic
-    models of articulated objects*, JAIR 41, 2011.
+    Both kinds are fitted by least squares, and the Bayesian information criterion compares them, as
+    in Sturm, Stachniss and Burgard, *A probabilistic framework for learning kinematic
+    models of articulated objects*, JAIR 41, 2011. A slide must also be straight enough to exclude a
+    hinge of up to 2 m radius, which it resembles after a short motion.
 
     Args:
         poses: Poses of the link in a fixed frame: placements, or x, y, z [m], roll, pitch, yaw
@@ -92,17 +95,25 @@ def estimate_joint(
     fits = {kind: _Fit(kind, data) for kind in ("revolute", "prismatic")}
     information = {kind: fit.information for kind, fit in fits.items()}
     information[_FIXED] = _compute_fixed_information(data)
-    best, second = sorted(information, key=lambda kind: information[kind])[:2]
-    if information[second] - information[best] < _DECISIVE or best == _FIXED:
-        kinds = " or ".join(sorted({best, second} - {_FIXED}) or [best])
-        travel, turn = data.measure_motion()
-        raise InputError(
-            "the motion is too short to tell the joint",
-            field="poses",
-            expected=f"enough motion to tell whether the link is {_FIXED}, slides or turns",
-            got=f"{1e3 * travel:.0f} mm and {np.degrees(turn):.1f}° ({kinds}?)",
-        )
-    return fits[best].make_estimate(information)
+    moving = min(fits, key=lambda kind: information[kind])
+    if information[_FIXED] - information[moving] < _DECISIVE:
+        raise _make_refusal(data, "it may stay")
+    if information["prismatic"] - information["revolute"] >= _DECISIVE:
+        return fits["revolute"].make_estimate(information)
+    if data.is_straight(fits["prismatic"].positions):
+        return fits["prismatic"].make_estimate(information)
+    raise _make_refusal(data, "it may turn or slide")
+
+
+def _make_refusal(data: _Data, doubt: str) -> InputError:
+    """Return the error about a motion that is too short to tell the joint."""
+    travel, turn = data.measure_motion()
+    return InputError(
+        "the motion is too short to tell the joint",
+        field="poses",
+        expected="enough motion to tell whether the link stays, slides or turns",
+        got=f"{1e3 * travel:.0f} mm and {np.degrees(turn):.1f}°: {doubt}",
+    )
 
 
 class _Data:
@@ -130,6 +141,19 @@ class _Data:
         errors = self.translations - translations
         turns = _compute_rotation_vectors(rotations.transpose(0, 2, 1) @ self.rotations)
         return np.hstack([errors / self.position_noise, turns / self.rotation_noise])
+
+    def is_straight(self, travels: Floats) -> bool:
+        """Return whether a motion turns less per metre than any hinge of usual size would.
+
+        A hinge of radius r turns by q / r over a travel q. The slope s of the rotations against the
+        travels q has the deviation σ / sqrt(Σ (q - mean q)²) in each component.
+        """
+        turned = _compute_rotation_vectors(self.rotations @ self.rotations[0].T)
+        centred = travels - travels.mean()
+        spread = float(centred @ centred)
+        slope = float(np.linalg.norm(centred @ turned)) / spread
+        deviation = self.rotation_noise / np.sqrt(spread)
+        return slope + _DOUBT * deviation < 1.0 / _LARGEST_RADIUS
 
     def measure_motion(self) -> tuple[float, float]:
         """Return the largest displacement [m] and rotation [rad] from the first pose."""
@@ -160,6 +184,7 @@ class _Fit:
             lambda x: self._compute_residuals(x).ravel(), start, jac=self._compute_jacobian
         )
         self._x = found.x
+        self.positions = np.concatenate([[0.0], found.x[self._shared :]])
         # With n values and k parameters, BIC = χ² + k log n, up to a constant.
         self.information = 2.0 * float(found.cost) + len(start) * np.log(data.size)
 

@@ -22,6 +22,9 @@ _LARGEST_RADIUS = 2.0  # [m] of a hinge
 _DOUBT = 3.0  # standard deviations up to which a rotation may be there
 _FEWEST_POSES = 4
 _SHARED = 10  # parameters that all poses share: 6 of the link, 2 of the direction, 2 of the point
+# A hinge that turns converges within 20. For a straight motion its axis recedes without end, and
+# more evaluations hardly change the sum of squares.
+_MAX_EVALUATIONS = 40
 _STEP = 1e-6  # of finite differences [m], [rad]
 
 
@@ -181,7 +184,10 @@ class _Fit:
         self._shared = _SHARED if kind == "revolute" else _SHARED - 2
         start = np.concatenate([np.zeros(self._shared), positions[1:]])
         found = least_squares(
-            lambda x: self._compute_residuals(x).ravel(), start, jac=self._compute_jacobian
+            lambda x: self._compute_residuals(x).ravel(),
+            start,
+            jac=self._compute_jacobian,
+            max_nfev=_MAX_EVALUATIONS,
         )
         self._x = found.x
         self.positions = np.concatenate([[0.0], found.x[self._shared :]])

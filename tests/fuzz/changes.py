@@ -58,7 +58,7 @@ RECODED = (
 @st.composite
 def change_bytes(draw: st.DrawFn, data: bytes) -> bytes:
     """Return the content of a file with one to three changes."""
-    changes = (*[_change_token] * 8, *[_change_span] * 2, _cut, _overwrite, _recode)
+    changes = (*[_change_token] * 8, *[_change_span] * 2, _truncate, _overwrite, _recode)
     for _ in range(draw(st.integers(1, 3))):
         data = draw(st.sampled_from(changes))(draw, data)[:MAX_BYTES]
     return data
@@ -82,7 +82,7 @@ def _change_span(draw: st.DrawFn, data: bytes) -> bytes:
     return data[:start] + data[start:end] * times + data[end:]
 
 
-def _cut(draw: st.DrawFn, data: bytes) -> bytes:
+def _truncate(draw: st.DrawFn, data: bytes) -> bytes:
     return data[: draw(st.integers(0, len(data)))]
 
 
@@ -107,7 +107,7 @@ def _iterate_paths(data: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any,
             yield from _iterate_paths(value, (*path, key))
 
 
-def get_at(data: Any, path: tuple[Any, ...]) -> Any:
+def get_value(data: Any, path: tuple[Any, ...]) -> Any:
     """Return the value at a path of keys and indices."""
     return functools.reduce(operator.getitem, path, data)
 
@@ -123,13 +123,13 @@ def change_data(
         if not paths:
             break
         path = draw(st.sampled_from(paths))
-        parent = get_at(data, path[:-1])
+        parent = get_value(data, path[:-1])
         key = path[-1]
         match draw(st.sampled_from(("set", "set", "set", "copy", "remove", "rename"))):
             case "set":
                 parent[key] = draw(values)
             case "copy":
-                parent[key] = copy.deepcopy(get_at(data, draw(st.sampled_from(paths))))
+                parent[key] = copy.deepcopy(get_value(data, draw(st.sampled_from(paths))))
             case "remove":
                 del parent[key]
             case _ if isinstance(parent, dict):

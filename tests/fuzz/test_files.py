@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 import vkc_pin as vkc
 from fuzz.bounds import PLANNING_SECONDS, expect_result_or_error, take_share
 from fuzz.calls import SMALL
-from fuzz.changes import change_bytes, change_data, get_at
+from fuzz.changes import change_bytes, change_data, get_value
 from fuzz.values import JSON, VALUES
 from vkc_pin.world.files.resources import find_resource_folder
 
@@ -89,12 +89,12 @@ def load_with_file(name: str, content: bytes, is_planned: bool = False) -> None:
     try:
         file.write_bytes(content)
         with expect_result_or_error(PLANNING_SECONDS if is_planned else 2.0):
-            check_scene(load_scene_of(file), is_planned)
+            check_scene(load_described_scene(file), is_planned)
     finally:
         file.write_bytes(original)
 
 
-def load_scene_of(file: Path) -> vkc.Scene:
+def load_described_scene(file: Path) -> vkc.Scene:
     """Load a robot, object or scene alone, and a scene that contains it."""
     scenes = copy_resources() / "scenes"
     entry: dict[str, Any] = {"name": "thing", "position": [3.0, 0.0, 0.5]}
@@ -150,11 +150,12 @@ def test_changed_documents_yield_a_scene_or_an_error(document: Any, is_planned: 
     [
         ("scenes/box.dae", "<p>0 2 1", "<p>0 2.5 1"),  # assimp read on for ever
         ("scenes/box.dae", "<p>0 2 1", "<p>0 ~ 1"),  # assimp took 12 GB in a minute
+        # OSError
         (
             "robots/husky_ur5e/husky_ur5e.urdf",
             "package://husky_ur5e/collision/base_link_0.stl",
             "x" * 10_000,
-        ),  # OSError
+        ),
     ],
     ids=["fraction as index", "tilde as index", "long file name"],
 )
@@ -179,7 +180,7 @@ def test_past_failures_of_documents_yield_a_scene_or_an_error(
     scene: str, path: tuple[Any, ...], change: dict[str, Any]
 ) -> None:
     document = copy.deepcopy(load_documents()[scene])
-    get_at(document, path).update(change)
+    get_value(document, path).update(change)
     with expect_result_or_error():
         vkc.Scene.from_document(document, find_resource_folder("scenes"))
 
@@ -187,7 +188,7 @@ def test_past_failures_of_documents_yield_a_scene_or_an_error(
 @pytest.mark.long
 def test_unchanged_files_and_documents_yield_a_scene() -> None:
     for name in list_files():
-        check_scene(load_scene_of(copy_resources() / name), name == "scenes/door.yaml")
+        check_scene(load_described_scene(copy_resources() / name), name == "scenes/door.yaml")
     for document in load_documents().values():
         scene = vkc.Scene.from_document(document, find_resource_folder("scenes"))
         check_scene(scene, is_planned=False)

@@ -113,7 +113,7 @@ def read_or_import(name: str, is_robot: bool, files: dict[str, bytes], is_import
 
 
 def call_reader(file: Path, root: Path, is_robot: bool, is_imported: bool) -> None:
-    """Read a file as what it describes, or import it."""
+    """Read the description in a file, or import it."""
     if is_robot and is_imported:
         import_robot(file, root / "out", samples=100, most_pieces=1)
     elif is_robot:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -302,10 +302,6 @@ class Description:
                 ahead.append(child)
         return placements
 
-    def find_joint(self, name: str) -> Joint:
-        """Return the joint of a name."""
-        return next(joint for joint in self.joints.values() if joint.name == name)
-
     def walk_up(self, link: str) -> Iterator[str]:
         """Yield a link and those that carry it, up to the root."""
         yield link
@@ -425,19 +421,31 @@ class Description:
         Raises:
             InputError: A mesh is missing.
         """
-        errors = list[InputError]()
+        description, omitted = self.omit_missing_visuals(
+            lambda mesh: is_home and self.is_fixed(mesh.link)
+        )
         notes = list[str]()
-        for mesh in self.missing:
-            if mesh.link not in self.links:
-                continue
-            if is_home and mesh.kind == "visual" and self.is_fixed(mesh.link):
-                lacks = f"link '{mesh.link}': there is no visual mesh {mesh.error.field}"
-                notes.append(f"{lacks}: left out, although nothing collides in its place")
-            else:
-                errors.append(mesh.error)
+        for mesh in omitted:
+            lacks = f"link '{mesh.link}': there is no visual mesh {mesh.error.field}"
+            notes.append(f"{lacks}: left out, although nothing collides in its place")
+        return description.add_notes(*notes)
+
+    def omit_missing_visuals(
+        self, can_omit: Callable[[MissingMesh], bool]
+    ) -> tuple[Description, list[MissingMesh]]:
+        """Return the description without missing meshes, and the visual ones that were omitted.
+
+        Args:
+            can_omit: Whether a visual mesh is not needed for collision.
+
+        Raises:
+            InputError: Other meshes are missing; the error lists all of them.
+        """
+        omitted = [mesh for mesh in self.missing if mesh.kind == "visual" and can_omit(mesh)]
+        errors = [mesh.error for mesh in self.missing if mesh not in omitted]
         if errors:
-            raise make_missing_error(errors, self.file)
-        return replace(self.add_notes(*notes), missing=())
+            raise _make_missing_error(errors, self.file)
+        return replace(self, missing=()), omitted
 
     def is_fixed(self, link: str) -> bool:
         """Return whether only fixed joints connect a link with the root."""
@@ -467,7 +475,7 @@ class Description:
         return children
 
 
-def make_missing_error(errors: Sequence[InputError], file: Path) -> InputError:
+def _make_missing_error(errors: Sequence[InputError], file: Path) -> InputError:
     """Return one error about all missing meshes of a file.
 
     Args:

@@ -19,7 +19,6 @@ from vkc_pin.importing.description import (
     Joint,
     Link,
     Part,
-    make_missing_error,
 )
 from vkc_pin.importing.formats.reading import read_description
 from vkc_pin.importing.robots.linkages import solve_linkages
@@ -165,17 +164,11 @@ def _leave_out_missing_visuals(description: Description) -> Description:
         InputError: Meshes are missing that would collide.
     """
     is_solid = any(link.collision for link in description.links.values())
-    errors = list[InputError]()
+    description, omitted = description.omit_missing_visuals(lambda mesh: is_solid)
     warnings = list(description.warnings)
-    for mesh in description.missing:
-        if mesh.kind == "visual" and is_solid:
-            lacks = f"{mesh.link}: there is no visual mesh {mesh.error.field}"
-            warnings.append(f"{lacks}: left out")
-        else:
-            errors.append(mesh.error)
-    if errors:
-        raise make_missing_error(errors, description.file)
-    return replace(description, missing=(), warnings=tuple(warnings))
+    for mesh in omitted:
+        warnings.append(f"{mesh.link}: there is no visual mesh {mesh.error.field}: left out")
+    return replace(description, warnings=tuple(warnings))
 
 
 def _complete_limits(description: Description) -> Description:

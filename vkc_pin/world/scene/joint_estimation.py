@@ -190,9 +190,13 @@ class _Fit:
             max_nfev=_MAX_EVALUATIONS,
         )
         self._x = found.x
-        self.positions = np.concatenate([[0.0], found.x[self._shared :]])
         # With n values and k parameters, BIC = χ² + k log n, up to a constant.
         self.information = 2.0 * float(found.cost) + len(start) * np.log(data.size)
+
+    @property
+    def positions(self) -> Floats:
+        """Joint position of each pose [rad] or [m], shape (N,)."""
+        return self._unpack(self._x)[3]
 
     def make_estimate(self, information: Mapping[str, float]) -> JointEstimate:
         """Return the estimate, with the deviations that follow from those of the poses.

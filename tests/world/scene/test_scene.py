@@ -95,6 +95,16 @@ def test_sampling_needs_a_free_start_region(tmp_path: Path) -> None:
             scene.sample_start(np.random.default_rng(0))
 
 
+@pytest.mark.parametrize("interval", [(-4.0, 4.0), (1.0, 1.0)])
+def test_start_region_may_fill_the_arena_or_be_a_point(
+    tmp_path: Path, interval: tuple[float, float]
+) -> None:
+    low, high = interval
+    scene = load_scene_text(tmp_path, TINY.replace("{x: [-1, 1]", f"{{x: [{low}, {high}]"))
+    assert scene.start_region is not None
+    assert tuple(scene.start_region.x) == interval
+
+
 def test_start_is_sampled_with_free_held_objects_only(tmp_path: Path) -> None:
     stick = "  - {name: pole, type: stick, position: [0, 0, 0.05]}\n"
     for held, is_valid in (("{pole: end}", True), ("{front: handle}", False)):

@@ -44,12 +44,9 @@ exclude_patterns = [
     "scenes",
 ]
 nitpicky = True
-# Names of other packages have no pages here; single backticks in docstrings are code first, and
-# links where they happen to lead.
-nitpick_ignore_regex = [
-    ("py:.*", r"(?!vkc_pin\.).*|.*<locals>.*"),
-    ("py:class", r"vkc_pin\.[\w.]+\.(_\w+|[A-Z]|\w+Schema|Annotated)"),
-]
+# Names of other packages and of modules have no pages here; single backticks in docstrings are code
+# first, and links where they happen to lead.
+nitpick_ignore_regex = [("py:.*", r"(?!vkc_pin\.).*|vkc_pin\.\w+\..*")]
 suppress_warnings = ["ref.python"]  # attributes of the same name in several classes
 
 # Markdown as GitHub reads it.

@@ -9,8 +9,6 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import api_pages
-
 # Under autodoc, which sets TYPE_CHECKING, its first import would end half way.
 import pydantic  # noqa: F401
 from docutils import nodes
@@ -54,11 +52,6 @@ def read(app: Sphinx, name: str, source: list[str]) -> None:
         r"\[(\w+)\.md\]\((\1\.md[^)]*)\)", r"[](\2)", source[0]
     )  # the page's title instead of its file's name
     source[0] = re.sub(r"\[([^\]]*)\]\((animations/\w+\.html)\)", r'<a href="\2">\1</a>', source[0])
-
-
-def generate(app: Sphinx) -> None:
-    """Write the reference pages of the packages before the source files are listed."""
-    api_pages.write()
 
 
 def find_outdated_pages(
@@ -110,17 +103,6 @@ def reset_signature(app: Sphinx, function: Any, bound: bool) -> None:
         vars(function.__func__).pop("__signature__", None)
 
 
-def skip_public(
-    app: Sphinx, what: str, name: str, member: Any, skipped: bool, options: Any
-) -> bool | None:
-    """Leave out public names of the package and its subpackages, which have their own pages."""
-    public = what == "module" and any(
-        name in owner.__all__ and getattr(owner, name) is member
-        for owner in (vkc, vkc.datasets, vkc.importing, vkc.procedural)
-    )
-    return True if public else None
-
-
 def resolve(
     app: Sphinx, env: BuildEnvironment, node: addnodes.pending_xref, content: nodes.Node
 ) -> nodes.Node | None:
@@ -152,12 +134,10 @@ def resolve(
 def setup(app: Sphinx) -> dict[str, Any]:
     """Connect all of it."""
     os.environ.setdefault("MPLBACKEND", "agg")
-    app.connect("builder-inited", generate)
     app.connect("source-read", read)
     app.connect("env-get-outdated", find_outdated_pages)
     app.connect("build-finished", films)
     app.connect("autodoc-process-docstring", escape_docstring, priority=400)
     app.connect("autodoc-before-process-signature", reset_signature, priority=900)
-    app.connect("autodoc-skip-member", skip_public)
     app.connect("missing-reference", resolve)
     return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}

@@ -122,7 +122,8 @@ def import_home(  # noqa: PLR0913 - keyword options of a public call
     Fixed links become obstacles of convex pieces. A fixed link with joints becomes an articulated
     object, for whose joints attachments are proposed. Floating links become free objects. The arena
     covers the home and, on sides without walls, 2 m of floor around it. The robot starts at a free
-    pose from which it reaches most objects. Long imports log their progress to `vkc_pin.importing`.
+    pose from which it reaches most objects. Long imports log their progress to the logger
+    ``vkc_pin.importing``.
 
     Args:
         file: The file; its z axis points up.

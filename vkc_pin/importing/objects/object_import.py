@@ -114,8 +114,8 @@ def import_object(  # noqa: PLR0913 - keyword options of a public call
 
     Its shapes become convex pieces, fixed links are merged with their masses, and missing limits
     chosen. The origin is below the centre, at the height of the lowest point.
-    Attachments are proposed for every joint. Long imports log their progress to
-    `vkc_pin.importing`.
+    Attachments are proposed for every joint. Long imports log their progress to the logger
+    ``vkc_pin.importing``.
 
     Args:
         file: The file.

@@ -41,6 +41,18 @@ def test_drawer_held_beside_its_handle_is_opened(tmp_path: Path) -> None:
     assert loaded.scene.holds == end.holds == plan.scene.holds
 
 
+def test_another_measured_grasp_builds_nothing() -> None:
+    """How an object is in the hand is data: one symbolic program serves all grasps."""
+    planner = vkc.Planner()
+    starts = [
+        make_start(0.0),
+        *(make_start(x).with_measured_grasp("drawer") for x in (0.005, -4e-3)),
+    ]
+    plans = [vkc.plan(start, [PULL], planner=planner) for start in starts]
+    assert all(plan.success for plan in plans)
+    assert [plan.statistics.build_time > 0.0 for plan in plans] == [True, False, False]
+
+
 def test_nominal_grasp_applies_after_the_release() -> None:
     """A grasp step is satisfied by the measured grasp."""
     steps = [vkc.Grasp("drawer"), PULL, vkc.Release(), vkc.Actuate("drawer", {"slide": 0.1})]

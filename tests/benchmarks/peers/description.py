@@ -68,9 +68,9 @@ def describe(problem: TrajectoryProblem, folder: Path, *, by_body: bool = False)
     names = tuple(name.replace(".", "_") for name in problem.chain.names)
     _add_joints(root, problem, names)
     if problem.pose_goals:
-        goal = problem.pose_goals[0].row
+        goal = problem.pose_goals[0]
         ET.SubElement(root, "link", name=FRAME)
-        _joint(root, f"to_{FRAME}", "fixed", f"body_{goal.joint}", FRAME, goal.local)
+        _joint(root, f"to_{FRAME}", "fixed", f"body_{goal.row.joint}", FRAME, goal.local)
     margins = dict(zip(map(tuple, part.pairs.tolist()), part.margins.tolist(), strict=True))
     least: dict[frozenset[int], float] = {}  # of each pair of bodies
     for (i, j), margin in margins.items():

@@ -76,7 +76,7 @@ def plan_by_sampling(  # noqa: C901, PLR0915 - sets up one planner, step by step
         return np.array([state[k] for k in range(size)]) / scale
 
     if held:
-        solver = problem.transcription.pose_solvers[0]
+        solver = problem.pose_solvers[0]
         target = problem.targets[0]
 
         class Closure(ob.Constraint):  # type: ignore[name-defined]

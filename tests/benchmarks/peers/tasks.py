@@ -127,7 +127,7 @@ def find_exact_start(problem: TrajectoryProblem) -> Floats:
 
 def _exact(problem: TrajectoryProblem, z: Floats, row: int) -> tuple[Floats, Bools]:
     """Project configurations (B, n) onto an exact pose in a row's bounds; also return which did."""
-    solver, *_ = problem.transcription.pose_solvers
+    solver, *_ = problem.pose_solvers
     target, *_ = problem.targets
     limits = {
         "lower": problem.lower[row],

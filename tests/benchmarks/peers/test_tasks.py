@@ -23,7 +23,7 @@ def test_problems_are_reproducible_and_start_collision_free(task: str) -> None:
     assert compute_shortfall(problem, problem.start[None], 1)[0] == 0.0
     goals = sample_goals(problem, np.random.default_rng(0), 5)
     assert 1 <= len(goals) <= 5
-    residual, _ = problem.transcription.pose_solvers[0].evaluate(goals, problem.targets[0])
+    residual, _ = problem.pose_solvers[0].evaluate(goals, problem.targets[0])
     assert np.abs(residual).max() < 1e-7
     distances = np.linalg.norm((goals - problem.start) * problem.chain.metric, axis=1)
     assert np.all(np.diff(distances) >= 0.0)

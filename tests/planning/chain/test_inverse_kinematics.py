@@ -39,7 +39,8 @@ def get_last_frame(chain: VirtualKinematicChain) -> tuple[int, pin.SE3]:
 def make_solver(
     chain: VirtualKinematicChain, kind: str = "pose", shift: Shift | None = None
 ) -> PoseSolver:
-    return PoseSolver(chain.model, PoseRow(*get_last_frame(chain), (), kind, shift))
+    joint, local = get_last_frame(chain)
+    return PoseSolver(chain.tree, PoseRow(joint, (), kind, shift), local, chain.cache)
 
 
 def compute_placement(

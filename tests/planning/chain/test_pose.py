@@ -8,13 +8,13 @@ import pinocchio as pin
 import pytest
 from helpers.memory import measure_growth
 
+from vkc_pin.planning.chain.kinematic_tree import flatten_placement
 from vkc_pin.planning.chain.pose import (
     POSE_OFFSET_SIZE,
     ROW_BOUNDS,
     build_pose_residual,
     build_pose_rows,
     compute_pose_offsets,
-    flatten_target,
     relax_target,
 )
 
@@ -45,7 +45,7 @@ SLOPES = {
 
 
 def evaluate(function: ca.Function, placement: pin.SE3, target: pin.SE3) -> np.ndarray:
-    found = function(placement.rotation, placement.translation, flatten_target(target))
+    found = function(placement.rotation, placement.translation, flatten_placement(target))
     return np.asarray(found).ravel()
 
 
@@ -104,7 +104,7 @@ def test_newton_steps_lead_away_from_half_turns(kind: str, axis: int) -> None:
     target, rng = pin.SE3.Random(), np.random.default_rng(2)
     placement = turn(kind, target, np.pi, rng, np.eye(3)[axis] if kind == "pose" else None)
     for _ in range(15):
-        at = (placement.rotation, placement.translation, flatten_target(target))
+        at = (placement.rotation, placement.translation, flatten_placement(target))
         slope = np.asarray(SLOPES[kind](*at, np.zeros(3)))[3:, 3:]
         residual = evaluate(RESIDUALS[kind], placement, target)[3:]
         step = -np.linalg.lstsq(slope, residual, rcond=1e-6)[0]
@@ -131,7 +131,7 @@ RELAX = ca.Function(
 
 
 def relax(target: pin.SE3, offset: np.ndarray, relaxation: float) -> pin.SE3:
-    vector = np.asarray(RELAX(flatten_target(target), offset, relaxation)).ravel()
+    vector = np.asarray(RELAX(flatten_placement(target), offset, relaxation)).ravel()
     return pin.SE3(vector[:9].reshape(3, 3).T, vector[9:])
 
 

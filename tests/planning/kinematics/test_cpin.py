@@ -7,6 +7,7 @@ import subprocess
 import sys
 import types
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import casadi
 import numpy as np
@@ -230,7 +231,8 @@ def test_upstream_and_compiled_backends_agree(arm: pin.Model) -> None:
     q, (v, a) = next(sample_configurations(arm)), np.random.default_rng(6).normal(size=(2, arm.nv))
     frame = arm.getFrameId("planar_tip")
     for name, arguments, inputs in (
-        ("joint_placements", (), (q,)),
+        ("joint_placements", ([],), (q,)),
+        ("joint_placements", ([2],), (q, stack_placements([arm.jointPlacements[2]]))),
         ("frame_placements", ([frame],), (q,)),
         ("frame_jacobian", (frame, 2), (q,)),
         ("rnea", (), (q, v, a)),
@@ -241,6 +243,25 @@ def test_upstream_and_compiled_backends_agree(arm: pin.Model) -> None:
             for backend in (backends.build_upstream, backends.build_compiled)
         )
         np.testing.assert_allclose(upstream, compiled, atol=TOLERANCE)
+
+
+def test_placements_of_joints_are_arguments() -> None:
+    """One function serves all models that differ in how the given joints are placed."""
+    model = make_tree("planar", "revolute_unaligned", "prismatic_y")
+    function = cpin.joint_placements(model, (3, 2))
+    for _ in range(3):
+        for joint in (2, 3):
+            model.jointPlacements[joint] = pin.SE3.Random()
+        placements = stack_placements([model.jointPlacements[joint] for joint in (3, 2)])
+        for q in sample_configurations(model):
+            found = function(q=q, P=placements)["M"].full()
+            np.testing.assert_allclose(found, compute_placements(model, q), atol=TOLERANCE)
+
+
+@pytest.mark.parametrize("given", [(0,), (9,), (1, 1), "12", (1.5,)])
+def test_given_joints_are_joints_of_the_model(given: Any) -> None:
+    with pytest.raises(InputError, match="given"):
+        cpin.joint_placements(make_tree("planar", "prismatic_y"), given)
 
 
 @pytest.mark.parametrize("first", ["casadi", "pinocchio", "vkc_pin.planning.kinematics"])

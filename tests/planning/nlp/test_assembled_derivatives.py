@@ -12,6 +12,7 @@ import pinocchio as pin
 from hypothesis import event, given, settings
 from hypothesis import strategies as st
 
+from vkc_pin.planning.chain.kinematic_tree import KinematicTree
 from vkc_pin.planning.chain.pose import ROW_BOUNDS, PoseRow
 from vkc_pin.planning.nlp.term_rows import FrameLocation, TermLocation, TermRow, Tree, Value
 from vkc_pin.planning.nlp.transcription import Transcription
@@ -39,6 +40,21 @@ def make_model(kind: str) -> pin.Model:
     follower = pin.JointModelMimic(slide, 0.5, 0.1)
     model.addJoint(parent, follower, LOCAL, "follower")
     return model
+
+
+@cache
+def make_root(kind: str) -> pin.Model:
+    """Return the model of `make_model` without its last two joints."""
+    model = make_model(kind)
+    root = pin.Model()
+    for joint in range(1, model.njoints - 2):
+        root.addJoint(
+            model.parents[joint],
+            model.joints[joint],
+            model.jointPlacements[joint],
+            model.names[joint],
+        )
+    return root
 
 
 def trace(write: Callable[[State], Any]) -> Formula:
@@ -90,6 +106,8 @@ def draw_term(draw: st.DrawFn, model: pin.Model, segments: int) -> TermRow:
 def draw_structure(draw: st.DrawFn) -> Structure:
     base = draw(st.sampled_from(["fixed", "omnidirectional", "wheeled"]))
     model = make_model(base)
+    # its last joint may be mounted: placed by an argument
+    root = draw(st.sampled_from([model, make_root(base)]))
     segments = draw(st.integers(1, 4))
     poses = []
     for _ in range(draw(st.integers(0, 2))):
@@ -97,7 +115,7 @@ def draw_structure(draw: st.DrawFn) -> Structure:
         waypoints = draw(st.lists(st.integers(1, segments), min_size=1, unique=True))
         kind = draw(st.sampled_from(sorted(ROW_BOUNDS)))
         shift = draw(st.none() | st.just((1, (0.1, -0.2, 0.3))))
-        poses.append(PoseRow(joint, LOCAL, tuple(sorted(waypoints)), kind, shift))
+        poses.append(PoseRow(joint, tuple(sorted(waypoints)), kind, shift))
     rolling = OMNIDIRECTIONAL
     if base == "wheeled":
         wheels = draw(st.sampled_from([{}, {"track": 0.5, "wheel_speed": 1.0}]))
@@ -110,7 +128,7 @@ def draw_structure(draw: st.DrawFn) -> Structure:
     interior = range(1, segments)
     stops = draw(st.lists(st.sampled_from(interior), unique=True)) if interior else []
     return Structure(
-        model=model,
+        tree=KinematicTree(model, root),
         segments=segments,
         poses=tuple(poses),
         slots=draw(st.integers(0, 2)),
@@ -136,10 +154,12 @@ def test_assembled_derivatives_equal_those_of_casadi(structure: Structure, seed:
         ca.jacobian(t.g, t.x),
         ca.triu(ca.hessian(lagrangian, t.x)[0]),
     ]
-    inputs = [t.x, t.parameters, t.multipliers, weight]
-    compare = ca.Function("compare", inputs, [*found, *expected])
+    symbols = {**t.parameter_symbols, "x": t.x, "lam": t.multipliers, "weight": weight}
+    compare = ca.Function("compare", list(symbols.values()), [*found, *expected])
     rng = np.random.default_rng(seed)
-    point = [rng.uniform(0.2, 1.0, symbol.numel()) for symbol in inputs]
+    values = {name: rng.uniform(0.2, 1.0, symbol.shape) for name, symbol in symbols.items()}
+    values["mounts"] = structure.tree.mounts  # whose rotations are rotations
+    point = list(values.values())
     matrices = [np.asarray(matrix) for matrix in compare(*point)]
     for one, other in zip(matrices[:3], matrices[3:], strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)

@@ -81,7 +81,7 @@ def test_pose_amounts_are_distance_plus_angle() -> None:
     z = sample_path(p, 0)
     found = measure(p, z, rates=False)
     expected = np.zeros(len(z))
-    for goal, solver in zip(p.pose_goals, p.transcription.pose_solvers, strict=True):
+    for goal, solver in zip(p.pose_goals, p.pose_solvers, strict=True):
         at = np.array(goal.row.waypoints) - 1
         distance, sine = np.linalg.norm(
             solver.evaluate(z[at], goal.target)[0].reshape(-1, 2, 3), axis=2

@@ -196,12 +196,12 @@ def test_pose_goals_hold_at_their_waypoints(
         else:
             closure, placed = closures[goal.object], scene.objects[goal.object]
             expected = closure.joint, closure.local, placed.placement
-        assert (goal.row.joint, goal.row.local, goal.target) == expected
+        assert (goal.row.joint, goal.local, goal.target) == expected
 
 
 def test_pose_error_and_drift_equal_their_definitions(opening: TrajectoryProblem) -> None:
     """Pose error is the largest residual at goals; drift is measured between waypoints."""
-    z, solvers = sample_path(opening), opening.transcription.pose_solvers
+    z, solvers = sample_path(opening), opening.pose_solvers
     path = opening.waypoints(z)
     at_goals = [
         np.abs(solver.evaluate(path[list(goal.row.waypoints)], goal.target)[0]).max()

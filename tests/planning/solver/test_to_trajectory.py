@@ -142,7 +142,7 @@ def test_chains_are_closed_between_waypoints_by_the_arm_alone() -> None:
     (goal,) = (goal for goal in problem.pose_goals if goal.kind == "closure")
     (solver,) = (
         solver
-        for one, solver in zip(problem.pose_goals, problem.transcription.pose_solvers, strict=True)
+        for one, solver in zip(problem.pose_goals, problem.pose_solvers, strict=True)
         if one is goal
     )
     is_held = np.array(

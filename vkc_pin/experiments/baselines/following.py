@@ -106,9 +106,10 @@ class ArmKinematics:
     def _get_model(self, pose: int) -> pin.Model:
         """Return the chain's model with a frame for a pose constraint."""
         if pose not in self._models:
-            row = self.problem.transcription.structure.poses[pose]
+            goal = self.problem.pose_goals[pose]
             model = pin.Model(self.problem.chain.model)
-            model.addFrame(pin.Frame(_FRAME, row.joint, row.local, pin.FrameType.OP_FRAME))
+            frame = pin.Frame(_FRAME, goal.row.joint, goal.local, pin.FrameType.OP_FRAME)
+            model.addFrame(frame)
             self._models[pose] = model
         return self._models[pose]
 

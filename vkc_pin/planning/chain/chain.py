@@ -7,16 +7,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
 
-import casadi as ca
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from vkc_pin.errors import InputError, UnknownNameError
-from vkc_pin.planning import kinematics as cpin
-from vkc_pin.planning.kinematics.batch import BatchFunction, estimate_size
+from vkc_pin.planning.chain.kinematic_tree import Kinematics, KinematicTree, get_kinematics
 from vkc_pin.utils.arguments import check_instance
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.utils.cache import Cache
@@ -32,41 +29,6 @@ from vkc_pin.world.scene.support import SupportedObject
 
 FREEDOM_VELOCITY = 1.0  # [rad/s] or [m/s], limit of a freedom of the grasp
 FREEDOM_ACCELERATION = 2.0
-
-
-class Kinematics:
-    """Kinematics of one model; all symbolic users share its expressions."""
-
-    def __init__(self, model: pin.Model) -> None:
-        self._coordinates = Coordinates(model)
-        self._function = cpin.joint_placements(model)
-
-    def build_placements(self, z: Any) -> Any:
-        """Return the placements of all joints at the symbols z, shape (n, 1), as (12, J − 1).
-
-        See `cpin.joint_placements`.
-        """
-        return self._function(self._coordinates.q_symbolic(z))
-
-    @cached_property
-    def batch(self) -> BatchFunction:
-        """Batch function z → columns of R and t of every joint's world placement, (12·(J − 1),)."""
-        z = ca.SX.sym("z", self._coordinates.size)
-        placements = ca.densify(self.build_placements(z))
-        return BatchFunction(ca.Function("placements", [z], [placements], {"cse": True}))
-
-    @property
-    def nbytes(self) -> int:
-        """Estimated size in memory [bytes]."""
-        size = estimate_size(self._function)
-        if "batch" in self.__dict__:  # it has been built
-            size += self.batch.nbytes
-        return size
-
-
-def get_kinematics(model: pin.Model, cache: Cache) -> Kinematics:
-    """Return the kinematics of a model, built if they are not in the cache."""
-    return cache.get(("kinematics", model.saveToString()), lambda: Kinematics(model))
 
 
 def invert(
@@ -241,9 +203,18 @@ class VirtualKinematicChain:
         return self.coordinates.turns + self.coordinates.lengths / self.robot.lever
 
     @cached_property
+    def tree(self) -> KinematicTree:
+        """The joints of the model, those of grasps and objects mounted on the robot's."""
+        return KinematicTree(self.model, self.robot.model)
+
+    @cached_property
     def _kinematics(self) -> Kinematics:
         """Kinematics, stored here because a cache lookup takes as long as an evaluation."""
-        return get_kinematics(self.model, self.cache)
+        return get_kinematics(self.tree, self.cache)
+
+    @cached_property
+    def _flat_mounts(self) -> Floats:
+        return self.tree.mounts.ravel(order="F")
 
     def joint_placements(self, z: Floats) -> tuple[Floats, Floats]:
         """Return the world placements of all joints at z, shape (W, n); joint 0 is the world.
@@ -253,7 +224,7 @@ class VirtualKinematicChain:
         """
         batch = len(z)
         joints = self.model.njoints
-        (placements,) = self._kinematics.batch(z)
+        (placements,) = self._kinematics.batch(z, self._flat_mounts)
         placements = placements.reshape(batch, joints - 1, 12)
         rotations = np.zeros((batch, joints, 3, 3))
         rotations[:, 0] = np.eye(3)
@@ -548,14 +519,15 @@ def _add_virtual_joint(
     added = {}
     freedoms = [*zip(attachment.coordinates, attachment.freedoms, strict=True)]
     for suffix, freedom in reversed(freedoms):
-        kind = pin.JointModelPrismaticUnaligned
+        joint = pin.JointModelPZ()
         if freedom.kind == "revolute":
-            kind = pin.JointModelRevoluteUnaligned
+            joint = pin.JointModelRZ()
         joint_name = f"{name}.{suffix}"
-        to_axis = pin.SE3(np.eye(3), freedom.through)
+        # z of the joint's frame is the negated axis, as in `invert`.
+        to_axis = pin.SE3(_rotate_z_to(-freedom.axis), freedom.through)
         parent = model.addJoint(
             parent,
-            kind(-freedom.axis),
+            joint,
             round_placement(placement * to_axis),
             joint_name,
             np.array([np.inf]),  # torque

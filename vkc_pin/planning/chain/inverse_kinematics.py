@@ -6,8 +6,8 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.planning.chain.chain import get_kinematics
-from vkc_pin.planning.chain.pose import PoseRow, build_pose_residual, flatten_target
+from vkc_pin.planning.chain.kinematic_tree import KinematicTree, flatten_placement, get_kinematics
+from vkc_pin.planning.chain.pose import PoseRow, build_pose_residual
 from vkc_pin.planning.kinematics.batch import BatchFunction
 from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.utils.budget import record_evaluations
@@ -16,38 +16,71 @@ from vkc_pin.utils.cache import Cache
 MAX_STEP = 0.5  # [m] or [rad]: maximum Gauss-Newton step of a coordinate
 
 
-class PoseSolver:
-    """Moves one frame of a model to a target pose, for a batch of configurations.
+class PoseFunctions:
+    """Functions of one pose goal of a tree, evaluated for batches of configurations z.
 
     Attributes:
         size: Number of coordinates n.
         rows: Number of residuals m: 6 for a pose, 5 for an upright pose, 3 for a point; see `pose`.
+        residual: (z, target, placement of the frame on its joint, mounts) → residual and its
+            Jacobian.
+        step: The same with lower and upper limits and weights of the coordinates → largest
+            residual, and z after a Gauss-Newton step.
     """
 
-    def __init__(self, model: pin.Model, pose: PoseRow, cache: Cache | None = None) -> None:
-        self.size = model.nv
+    def __init__(self, tree: KinematicTree, pose: PoseRow, cache: Cache) -> None:
+        self.size = tree.coordinates.size
         z = ca.SX.sym("z", self.size)
         target = ca.SX.sym("W", 12)
-        placements = get_kinematics(model, cache or Cache()).build_placements(z)
-        rotation, translation = pose.build_placement(placements)
+        local = ca.SX.sym("L", 12)
+        mounts = ca.SX.sym("P", 12, tree.mount_count)
+        placements = get_kinematics(tree, cache).build_placements(z, mounts)
+        rotation, translation = pose.build_placement(placements, local)
         residual = ca.densify(build_pose_residual(pose.kind, rotation, translation, target))
         self.rows = int(residual.numel())
         jacobian = ca.densify(ca.jacobian(residual, z))
-        self._function = BatchFunction(ca.Function("pose", [z, target], [residual, jacobian]))
+        inputs = [z, target, local, mounts]
+        self.residual = BatchFunction(ca.Function("pose", inputs, [residual, jacobian]))
         lower = ca.SX.sym("lower", self.size)
         upper = ca.SX.sym("upper", self.size)
         weights = ca.SX.sym("weights", self.size)
         step = _build_step(z, residual, jacobian, weights, (lower, upper))
         error = ca.mmax(ca.fabs(residual))
         moved = ca.fmin(ca.fmax(z + step, lower), upper)
-        self._step_function = BatchFunction(
-            ca.Function("moved", [z, target, lower, upper, weights], [error, moved])
-        )
+        inputs += [lower, upper, weights]
+        self.step = BatchFunction(ca.Function("moved", inputs, [error, moved]))
 
     @property
     def nbytes(self) -> int:
         """Estimated size in memory [bytes]."""
-        return self._function.nbytes + self._step_function.nbytes
+        return self.residual.nbytes + self.step.nbytes
+
+
+def get_pose_functions(tree: KinematicTree, pose: PoseRow, cache: Cache) -> PoseFunctions:
+    """Return the functions of a pose goal, built if they are not in the cache."""
+    key = ("pose", tree.key, pose.key)
+    return cache.get(key, lambda: PoseFunctions(tree, pose, cache))
+
+
+class PoseSolver:
+    """Moves one frame of a tree to a target pose, for a batch of configurations.
+
+    Args:
+        tree: The tree.
+        pose: Kind of the goal, and the joint of its frame.
+        local: Placement of the frame on its joint.
+        cache: Cache of its functions.
+
+    Attributes:
+        size: Number of coordinates n.
+        rows: Number of residuals m; see `PoseFunctions`.
+    """
+
+    def __init__(self, tree: KinematicTree, pose: PoseRow, local: pin.SE3, cache: Cache) -> None:
+        self._functions = get_pose_functions(tree, pose, cache)
+        self.size = self._functions.size
+        self.rows = self._functions.rows
+        self._data = flatten_placement(local), tree.mounts.ravel(order="F")
 
     def evaluate(self, z: Floats, target: pin.SE3) -> tuple[Floats, Floats]:
         """Return the pose residuals and their Jacobians at `z`.
@@ -59,7 +92,7 @@ class PoseSolver:
         Returns:
             Residuals, shape (B, m), [m] and [rad], and Jacobians, shape (B, m, n).
         """
-        residual, jacobian = self._function(z, flatten_target(target))
+        residual, jacobian = self._functions.residual(z, flatten_placement(target), *self._data)
         columns = jacobian.reshape(len(z), self.size, self.rows)
         return residual, columns.swapaxes(1, 2)
 
@@ -89,7 +122,7 @@ class PoseSolver:
             Configurations, shape (B, n), and a mask of those that satisfy the pose, shape (B,).
         """
         z = np.clip(z, lower, upper)
-        goal = flatten_target(target)
+        data = (flatten_placement(target), *self._data)
         errors = np.empty(len(z))
         # Indices of unsolved configurations; their values and limits.
         unsolved = np.arange(len(z))
@@ -98,7 +131,7 @@ class PoseSolver:
         upper = np.broadcast_to(upper, z.shape)
         for remaining in range(iterations, -1, -1):
             record_evaluations(len(rows))
-            error, moved = self._step_function(rows, goal, lower, upper, weights)
+            error, moved = self._functions.step(rows, *data, lower, upper, weights)
             errors[unsolved] = error[:, 0]
             is_unsolved = error[:, 0] >= tolerance
             if not is_unsolved.all():

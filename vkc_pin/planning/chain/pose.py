@@ -31,11 +31,12 @@ ROW_BOUNDS: Mapping[str, tuple[Floats, Floats]] = {
 
 @dataclass(frozen=True)
 class PoseRow:
-    """A frame that must attain a parametric placement at some waypoints.
+    """The constraint rows of a frame that must attain a placement at some waypoints.
+
+    The placement, and that of the frame on its joint, are arguments of the rows.
 
     Attributes:
         joint: Joint of the model that carries the frame.
-        local: Placement of the frame on the joint.
         waypoints: Waypoints at which the goal applies, counted from 1.
         kind: "pose", "point", "upright" or "level"; see `pose`.
         shift: (joint, vector): vector [m] in that joint's frame that is added to the translation.
@@ -43,7 +44,6 @@ class PoseRow:
     """
 
     joint: int
-    local: pin.SE3
     waypoints: tuple[int, ...]
     kind: str = "pose"
     shift: tuple[int, tuple[float, float, float]] | None = None
@@ -53,25 +53,37 @@ class PoseRow:
         """Number of constraint rows."""
         return len(ROW_BOUNDS[self.kind][0])
 
-    def build_placement(self, placements: Any) -> tuple[Any, Any]:
-        """Return the frame's rotation and translation, given all joint placements, (12, J − 1)."""
+    @property
+    def key(self) -> tuple[Any, ...]:
+        """Cache key of the rows at one waypoint."""
+        return self.joint, self.kind, self.shift
+
+    def build_placement(self, placements: Any, local: Any) -> tuple[Any, Any]:
+        """Return the frame's rotation and translation.
+
+        Args:
+            placements: Placements of all joints, (12, J − 1).
+            local: Placement of the frame on its joint, (12, 1).
+        """
         column = placements[:, self.joint - 1]
         rotation = ca.reshape(column[:9], 3, 3)
-        translation = rotation @ self.local.translation + column[9:]
+        translation = rotation @ local[9:] + column[9:]
         if self.shift is not None:
             joint, vector = self.shift
             shift_rotation = ca.reshape(placements[:9, joint - 1], 3, 3)
             translation = translation + shift_rotation @ ca.DM(vector)
-        return rotation @ self.local.rotation, translation
+        return rotation @ ca.reshape(local[:9], 3, 3), translation
 
-    def compute_placements(self, rotations: Floats, translations: Floats) -> tuple[Floats, Floats]:
+    def compute_placements(
+        self, rotations: Floats, translations: Floats, local: pin.SE3
+    ) -> tuple[Floats, Floats]:
         """Return rotations and translations of the frame, (B, ...), given those of all joints."""
         rotation = rotations[:, self.joint]
-        translation = rotation @ self.local.translation + translations[:, self.joint]
+        translation = rotation @ local.translation + translations[:, self.joint]
         if self.shift is not None:
             joint, vector = self.shift
             translation = translation + rotations[:, joint] @ np.array(vector)
-        return rotation @ self.local.rotation, translation
+        return rotation @ local.rotation, translation
 
 
 _VERTICAL = ("upright", "level")
@@ -244,8 +256,3 @@ def _compute_tilt(rotation: Any, target: Any) -> tuple[Any, Any]:
     """
     vertical = ca.reshape(target[:9], 3, 3) @ rotation[2, :].T
     return vertical[:2], vertical[2]
-
-
-def flatten_target(placement: pin.SE3) -> Floats:
-    """Return `placement` as the 12 numbers of a target."""
-    return np.concatenate([placement.rotation.T.ravel(), placement.translation])

@@ -97,7 +97,7 @@ def _find_collisions_at_start(problem: TrajectoryProblem) -> list[Violation]:
 def _find_open_closures_at_start(problem: TrajectoryProblem) -> list[Violation]:
     """Find the grasps of the start that the hand does not have there."""
     violations = []
-    for goal, solver in zip(problem.pose_goals, problem.transcription.pose_solvers, strict=True):
+    for goal, solver in zip(problem.pose_goals, problem.pose_solvers, strict=True):
         is_closure_of_start = goal.kind == "closure" and 1 in goal.row.waypoints
         if not is_closure_of_start or goal.object not in problem.scene.held:
             continue

@@ -122,7 +122,7 @@ def _find_base_goals(problem: TrajectoryProblem, number: int) -> tuple[list[_Bas
     for goal in problem.pose_goals:
         if end not in goal.row.waypoints or goal.row.kind == "level" or goal.row.shift is not None:
             continue
-        frame = goal.row.joint, goal.row.local.translation
+        frame = goal.row.joint, goal.local.translation
         shoulder, length = _compute_arm_reach(problem, *frame)
         at = goal.target.translation
         height = abs(at[2] - shoulder[2])

@@ -39,10 +39,7 @@ class ApproachPaths:
         joint, local = self.chain.frame(self.chain.robot.tool_frame)
         self.joint = joint
         self.local = local
-        model = self.chain.model
-        cache = self.problem.cache
-        key = ("tool", model.saveToString(), joint, local.homogeneous.tobytes())
-        self.solver = cache.get(key, lambda: PoseSolver(model, PoseRow(joint, local, ()), cache))
+        self.solver = PoseSolver(self.chain.tree, PoseRow(joint, ()), local, self.problem.cache)
 
     def find_approach_start(self, z: Floats, phase: Phase) -> Floats:
         """Return the start of the approach to z, shape (n,), the end of a phase: (K, n), K ≤ 1."""

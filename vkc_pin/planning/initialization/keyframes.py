@@ -105,7 +105,7 @@ class KeyframeSampler:
 
     def get_pose_solver(self, pose: int) -> tuple[PoseSolver, pin.SE3]:
         """Return the inverse kinematics solver of a pose constraint, and its target."""
-        return self.problem.transcription.pose_solvers[pose], self.problem.targets[pose]
+        return self.problem.pose_solvers[pose], self.problem.targets[pose]
 
     def solve_pose(
         self, z: Floats, pose: int, lower: Floats, upper: Floats, **how: Any
@@ -312,13 +312,14 @@ class KeyframeSampler:
         is the turn by atan2(E_yx − E_xy, E_xx + E_yy). A base at p, with the frame at t, moves to
         t* + turn·(p − t).
         """
-        row = self.problem.transcription.structure.poses[pose]
-        target = self.problem.targets[pose]
+        goal = self.problem.pose_goals[pose]
+        target = goal.target
+        joint = goal.row.joint
         rotations, translations = self.chain.joint_placements(z)
-        rotation = rotations[:, row.joint] @ row.local.rotation
-        translation = rotations[:, row.joint] @ row.local.translation + translations[:, row.joint]
+        rotation = rotations[:, joint] @ goal.local.rotation
+        translation = rotations[:, joint] @ goal.local.translation + translations[:, joint]
         error = np.einsum("ij,bkj->bik", target.rotation, rotation)
-        if row.kind == "pose":
+        if goal.row.kind == "pose":
             turn = np.arctan2(error[:, 1, 0] - error[:, 0, 1], error[:, 0, 0] + error[:, 1, 1])
         else:  # any heading will do
             turn = self.rng.uniform(-np.pi, np.pi, len(z))

@@ -56,18 +56,29 @@ def backend_name() -> str:
     return _get_backend().__name__.removeprefix("build_")
 
 
-def joint_placements(model: pin.Model) -> casadi.Function:
+def joint_placements(model: pin.Model, given: Sequence[int] = ()) -> casadi.Function:
     """Return the function q → M of the placements of all joints in the world.
 
     Args:
         model: The model, with nq configuration entries and njoints joints including the universe.
+        given: Joints whose placement on their parent is an argument P of the function, instead of
+            the model's. So one function serves all models that differ in these placements.
 
     Returns:
-        q, shape (nq, 1) → M, shape (12, njoints - 1). Column i belongs to joint i + 1 (the universe
-        is omitted) and stacks the columns of the rotation matrix and the translation [m]: [R[:, 0];
-        R[:, 1]; R[:, 2]; t].
+        q, shape (nq, 1), and if any joints are `given`, P, shape (12, len(given)) → M, shape (12,
+        njoints - 1). Column i belongs to joint i + 1 (the universe is omitted) and stacks the
+        columns of the rotation matrix and the translation [m]: [R[:, 0]; R[:, 1]; R[:, 2]; t]; so
+        do the columns of P.
+
+    Raises:
+        InputError: A given joint is not one of 1 to njoints - 1, or given twice.
     """
-    return _get_backend()("joint_placements", _round_quarter_turns(model))
+    listed: tuple[Any, ...] = check_list(given, "given", "a list of joints")
+    indices = [check_integer(joint, "given", low=1) for joint in listed]
+    if len(set(indices)) < len(indices) or max(indices, default=0) >= model.njoints:
+        expected = f"different joints from 1 to {model.njoints - 1}"
+        raise InputError("wrong joints", field="given", expected=expected, got=indices)
+    return _get_backend()("joint_placements", _round_quarter_turns(model), indices)
 
 
 def frame_placements(model: pin.Model, frames: Sequence[str | int]) -> casadi.Function:

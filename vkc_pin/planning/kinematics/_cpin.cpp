@@ -71,16 +71,33 @@ std::string pack(
   return Function(name, in, {cse(out)}, names_in, {name_out}).serialize();
 }
 
-std::string joint_placements(const std::string & text)
+// The inverse of `column`.
+SE3 to_placement(const SX & column)
 {
-  const Model model = load(text);
+  SE3 placement;
+  for (casadi_int i = 0; i < 9; ++i)
+    placement.rotation()(i % 3, i / 3) = column(i);
+  for (casadi_int i = 0; i < 3; ++i)
+    placement.translation()[i] = column(9 + i);
+  return placement;
+}
+
+std::string joint_placements(const std::string & text, const std::vector<std::size_t> & given)
+{
+  Model model = load(text);
   Data data(model);
-  const SX q = SX::sym("q", model.nq);
+  const SX q = SX::sym("q", model.nq), mounts = SX::sym("P", 12, given.size());
+  for (std::size_t i = 0; i < given.size(); ++i)
+    model.jointPlacements.at(given[i]) =
+      to_placement(mounts(casadi::Slice(), static_cast<casadi_int>(i)));
   algorithms::forward_kinematics(model, data, to_eigen(q));
   std::vector<SX> columns{SX(12, 0)};
   for (std::size_t i = 1; i < data.oMi.size(); ++i)
     columns.push_back(column(data.oMi[i]));
-  return pack("joint_placements", {q}, SX::horzcat(columns), {"q"}, "M");
+  const SX placements = SX::horzcat(columns);
+  if (given.empty())
+    return pack("joint_placements", {q}, placements, {"q"}, "M");
+  return pack("joint_placements", {q, mounts}, placements, {"q", "P"}, "M");
 }
 
 std::string frame_placements(const std::string & text, const std::vector<std::size_t> & frames)

@@ -82,6 +82,12 @@ def build_upstream(name: str, model: pin.Model, *arguments: Any) -> casadi.Funct
     data = symbolic.createData()
     q = casadi.SX.sym("q", model.nq, 1)
     inputs = {"q": q}
+    if name == "joint_placements" and arguments[0]:
+        inputs["P"] = casadi.SX.sym("P", 12, len(arguments[0]))
+        for column, joint in enumerate(arguments[0]):
+            mount = inputs["P"][:, column]
+            rotation = casadi.reshape(mount[:9], 3, 3)
+            symbolic.jointPlacements[joint] = cpin.SE3(rotation, mount[9:])
     if name == "rnea":
         inputs["v"] = casadi.SX.sym("v", model.nv, 1)
         inputs["a"] = casadi.SX.sym("a", model.nv, 1)

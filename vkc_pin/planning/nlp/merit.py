@@ -100,7 +100,9 @@ def _compute_pose_offsets(problem: TrajectoryProblem, z: Floats) -> Floats:
         if not goal.row.waypoints:
             continue
         at = np.array(goal.row.waypoints) - 1
-        rotation, translation = goal.row.compute_placements(rotations[at], translations[at])
+        rotation, translation = goal.row.compute_placements(
+            rotations[at], translations[at], goal.local
+        )
         pose_offsets[at, k] = compute_pose_offsets(
             goal.row.kind, rotation, translation, goal.target
         )

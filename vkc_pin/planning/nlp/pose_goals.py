@@ -20,7 +20,8 @@ class PoseGoal:
     """A frame with a target pose.
 
     Attributes:
-        row: The frame, and the waypoints at which the goal applies.
+        row: The joint of the frame, and the waypoints at which the goal applies.
+        local: Placement of the frame on its joint.
         target: Target placement in the world.
         kind: "closure" of a grasped object that is fixed in the world; "grasp" of a free object;
             "approach", the start of the straight path to a grasp; "level", for a carrier on which
@@ -30,6 +31,7 @@ class PoseGoal:
     """
 
     row: PoseRow
+    local: pin.SE3
     target: pin.SE3
     kind: Literal["closure", "grasp", "approach", "level", "goal"]
     about: str
@@ -70,13 +72,13 @@ def make_pose_goals(
             carrier = scene.objects[hold.object].object
             if carrier.free:
                 joint, local = chain.frame(carrier.base_link, hold)
-                row = PoseRow(joint, local, tuple(range(first + 1, last + 1)), "level")
+                row = PoseRow(joint, tuple(range(first + 1, last + 1)), "level")
                 level = supported.carrier_placement
-                goals.append(PoseGoal(row, level, "level", hold.object, hold.object))
+                goals.append(PoseGoal(row, local, level, "level", hold.object, hold.object))
         for goal in phase.frames:
             joint, local = chain.frame(goal.frame, goal.hold, opening=phase.opening)
-            row = PoseRow(joint, local, (last,), goal.kind)
-            goals.append(PoseGoal(row, goal.placement, "goal", str(goal)))
+            row = PoseRow(joint, (last,), goal.kind)
+            goals.append(PoseGoal(row, local, goal.placement, "goal", str(goal)))
     return tuple(goals)
 
 
@@ -92,8 +94,8 @@ def _make_approach_goal(
     target = phase.resting.get(hold.object, closure.target)
     joint, frame = chain.holder(hold)
     x, y, z = (distance * frame.rotation[:, 2]).tolist()
-    row = PoseRow(closure.joint, closure.local, (waypoint,), shift=(joint, (x, y, z)))
-    return PoseGoal(row, target, "approach", str(hold), hold.object)
+    row = PoseRow(closure.joint, (waypoint,), shift=(joint, (x, y, z)))
+    return PoseGoal(row, closure.local, target, "approach", str(hold), hold.object)
 
 
 def _make_grasp_goals(
@@ -106,8 +108,9 @@ def _make_grasp_goals(
     if scene.objects[name].object.free:
         for phase, _, last in spans:
             if hold in phase.grasps:
-                row = PoseRow(closure.joint, closure.local, (last,))
-                goals.append(PoseGoal(row, phase.resting[name], "grasp", str(hold), name))
+                row = PoseRow(closure.joint, (last,))
+                resting = phase.resting[name]
+                goals.append(PoseGoal(row, closure.local, resting, "grasp", str(hold), name))
         return goals
     waypoints = list[int]()
     for phase, first, last in spans:
@@ -116,8 +119,8 @@ def _make_grasp_goals(
         elif hold in phase.held:
             waypoints += range(first + 1, last + 1)
     if waypoints:
-        row = PoseRow(closure.joint, closure.local, tuple(waypoints))
-        goals.append(PoseGoal(row, closure.target, "closure", name, name))
+        row = PoseRow(closure.joint, tuple(waypoints))
+        goals.append(PoseGoal(row, closure.local, closure.target, "closure", name, name))
     return goals
 
 

@@ -12,7 +12,9 @@ import numpy as np
 from vkc_pin.options import Options
 from vkc_pin.planning.chain.chain import VirtualKinematicChain, consolidate
 from vkc_pin.planning.chain.contacts import ContactModel, Contacts
-from vkc_pin.planning.chain.pose import ROW_BOUNDS, flatten_target
+from vkc_pin.planning.chain.inverse_kinematics import PoseSolver
+from vkc_pin.planning.chain.kinematic_tree import flatten_placement
+from vkc_pin.planning.chain.pose import ROW_BOUNDS
 from vkc_pin.planning.nlp.objective import MotionCost
 from vkc_pin.planning.nlp.pose_goals import (
     find_approach_waypoint,
@@ -60,6 +62,7 @@ class TrajectoryProblem:
             joint goals.
         pose_goals: Pose goals (eqs. 2 and 3), one for each of `transcription.structure.poses`.
         targets: Their target placements.
+        pose_solvers: Inverse kinematics of each.
         choices: Freedoms chosen when a hand clamps: column, grasp waypoint and last waypoint held.
         terms: User-defined constraints and costs that can change something in this task, one for
             each of `transcription.structure.terms`.
@@ -91,13 +94,19 @@ class TrajectoryProblem:
         self.targets = tuple(goal.target for goal in self.pose_goals)
         rows, self.terms = locate_terms(scene, self.chain, task, terms)
         self.transcription = transcribe(self._make_structure(rows), self.cache)
+        self.pose_solvers = tuple(
+            PoseSolver(self.chain.tree, goal.row, goal.local, self.cache)
+            for goal in self.pose_goals
+        )
         self.motion_cost = self._make_motion_cost()
         self.start = self._make_start()
         self.lower, self.upper = self._make_bounds()
         self.start.setflags(write=False)
         self.lower.setflags(write=False)
         self.upper.setflags(write=False)
-        self.term_evaluator = TermEvaluator(self.terms, self.transcription, self.start)
+        self.term_evaluator = TermEvaluator(
+            self.terms, self.transcription, self.start, self.chain.tree.mounts
+        )
         self.term_evaluator.check(self.still, np.full(self.segments, options.dt))
 
     def with_bounds(self, lower: Floats, upper: Floats) -> TrajectoryProblem:
@@ -135,7 +144,7 @@ class TrajectoryProblem:
             if phase.grasps or next_phase.released:
                 stops.append(end)
         return Structure(
-            model=self.chain.model,
+            tree=self.chain.tree,
             segments=self.segments,
             poses=tuple(goal.row for goal in self.pose_goals),
             slots=self.options.contact_slots,
@@ -299,7 +308,7 @@ class TrajectoryProblem:
     def pose_error(self, z: Floats) -> float:
         """Return the largest residual of closure (eq. 2), goals (eq. 3) and rolling [m], [rad]."""
         errors = [0.0]
-        for goal, solver in zip(self.pose_goals, self.transcription.pose_solvers, strict=True):
+        for goal, solver in zip(self.pose_goals, self.pose_solvers, strict=True):
             if goal.row.waypoints:
                 residual, _ = solver.evaluate(z[np.array(goal.row.waypoints) - 1], goal.target)
                 errors.append(float(np.abs(residual).max()))
@@ -318,7 +327,9 @@ class TrajectoryProblem:
         if t.rows == t.first_relaxed_row:
             return np.zeros(0)
         gears = self.rolling.compute_gears(self.waypoints(z))
-        values = t.relaxed_row_values(t.pack(z), self.start, timing.dt, gears)
+        values = t.relaxed_row_values(
+            t.pack(z), self.start, timing.dt, gears, self.chain.tree.mounts
+        )
         values = np.asarray(values).ravel()
         lower, upper = self.row_bounds(timing if rates else None)
         relaxed = slice(t.first_relaxed_row, t.rows)
@@ -345,7 +356,7 @@ class TrajectoryProblem:
         midpoints = (path[1:] + path[:-1]) / 2
         allowed = np.array([_TOLERANCES.closure_position, _TOLERANCES.closure_angle])
         worst = 0.0
-        for goal, solver in zip(self.pose_goals, self.transcription.pose_solvers, strict=True):
+        for goal, solver in zip(self.pose_goals, self.pose_solvers, strict=True):
             at = goal.row.waypoints
             closed_segments = [t - 1 for t in at if t - 1 in at]  # closed at both ends
             if closed_segments and goal.kind == "closure":
@@ -382,7 +393,9 @@ class TrajectoryProblem:
         step_weights, change_weights = self.motion_cost.weights(*self.rates(z))
         return {
             "start": self.start,
-            "targets": np.array([flatten_target(target) for target in self.targets]),
+            "targets": np.array([flatten_placement(goal.target) for goal in self.pose_goals]),
+            "frames": np.array([flatten_placement(goal.local) for goal in self.pose_goals]),
+            "mounts": self.chain.tree.mounts,
             "step_weights": step_weights,
             "change_weights": change_weights,
             "gears": self.rolling.compute_gears(self.waypoints(z)),

@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError
 from vkc_pin.planning.chain.chain import VirtualKinematicChain
-from vkc_pin.planning.chain.pose import flatten_target
+from vkc_pin.planning.chain.kinematic_tree import flatten_placement
 from vkc_pin.planning.nlp.pose_goals import find_phase_spans
 from vkc_pin.planning.nlp.term_rows import FrameLocation, TermLocation, TermRow, Tree, Value
 from vkc_pin.planning.nlp.transcription import Transcription
@@ -125,7 +125,7 @@ class _FrameLocator:
 
 
 def _flatten_placement(placement: pin.SE3) -> tuple[float, ...]:
-    return tuple(flatten_target(placement).tolist())
+    return tuple(flatten_placement(placement).tolist())
 
 
 class TermEvaluator:
@@ -137,8 +137,11 @@ class TermEvaluator:
         scale: Factor from violation to scaled violation, shape (R,).
     """
 
-    def __init__(self, terms: Sequence[Term], transcription: Transcription, start: Floats) -> None:
+    def __init__(
+        self, terms: Sequence[Term], transcription: Transcription, start: Floats, mounts: Floats
+    ) -> None:
         self.terms = terms
+        self.mounts = mounts
         self.transcription = transcription
         self.start = start
         # Concatenation needs at least one part each.
@@ -231,5 +234,7 @@ class TermEvaluator:
     def _evaluate(self, z: Floats, dt: Floats) -> tuple[Floats, Any, float, Any]:
         """Return values and Jacobian of the constraints, and sum and gradient of the costs."""
         x = self.transcription.pack(z)
-        values, jacobian, cost, gradient = self.transcription.term_values(x, self.start, dt)
+        values, jacobian, cost, gradient = self.transcription.term_values(
+            x, self.start, dt, self.mounts
+        )
         return np.asarray(values).ravel(), jacobian, float(cost), np.asarray(gradient.nonzeros())

@@ -13,12 +13,11 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.planning.chain.chain import get_kinematics
+from vkc_pin.planning.chain.kinematic_tree import KinematicTree, get_kinematics
 from vkc_pin.planning.kinematics.batch import estimate_size
 from vkc_pin.planning.nlp.sparse import assemble, get_pattern
 from vkc_pin.utils.arrays import Ints
 from vkc_pin.utils.cache import Cache
-from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.task.terms import Formula
 
 
@@ -106,7 +105,9 @@ class TermRow:
 
 
 class TermFunctions:
-    """SX functions of one kind of row, of z of all waypoints involved and the step duration.
+    """SX functions of one kind of row.
+
+    Their arguments are z of all waypoints involved, the step duration and the mounts.
 
     Attributes:
         value, jacobian, hessian: The formula, the nonzeros of its Jacobian, and those of the
@@ -116,17 +117,18 @@ class TermFunctions:
 
     def __init__(
         self,
-        model: pin.Model,
+        tree: KinematicTree,
         row: TermRow,
         at: TermLocation,
         before: int,
         waypoints: int,
         cache: Cache,
     ) -> None:
-        n = Coordinates(model).size
+        n = tree.coordinates.size
         formula = row.formula
         z = ca.SX.sym("z", n * waypoints)
         dt = ca.SX.sym("dt")
+        mounts = ca.SX.sym("P", 12, tree.mount_count)
         multipliers = ca.SX.sym("lam", formula.rows)
         points = ca.vertsplit(z, n) if waypoints else []
         placements_by_waypoint: dict[int, Any] = {}
@@ -140,8 +142,8 @@ class TermFunctions:
             if frame.joint == 0:
                 return ca.DM(frame.local)
             if frame.waypoint not in placements_by_waypoint:
-                kinematics = get_kinematics(model, cache)
-                placements = kinematics.build_placements(points[frame.waypoint])
+                kinematics = get_kinematics(tree, cache)
+                placements = kinematics.build_placements(points[frame.waypoint], mounts)
                 placements_by_waypoint[frame.waypoint] = placements
             joint = _to_matrix(placements_by_waypoint[frame.waypoint][:, frame.joint - 1])
             return _to_column(joint @ local)
@@ -156,9 +158,10 @@ class TermFunctions:
         slopes = ca.vertcat(*jacobian.nonzeros())
         curvatures = ca.vertcat(*hessian.nonzeros())
         options = {"cse": True}
-        self.value = ca.Function("term", [z, dt], [value], options)
-        self.jacobian = ca.Function("term_jacobian", [z, dt], [slopes], options)
-        self.hessian = ca.Function("term_hessian", [z, dt, multipliers], [curvatures], options)
+        given = [z, dt, ca.vec(mounts)]
+        self.value = ca.Function("term", given, [value], options)
+        self.jacobian = ca.Function("term_jacobian", given, [slopes], options)
+        self.hessian = ca.Function("term_hessian", [*given, multipliers], [curvatures], options)
         self.jacobian_pattern = get_pattern(jacobian)
         self.hessian_pattern = get_pattern(hessian)
         self.nbytes = estimate_size(self.value, self.jacobian, self.hessian)
@@ -178,7 +181,8 @@ def _place_in_tree(frame: FrameLocation, tree: Tree, points: list[Any], cache: C
     model = pin.Model()
     model.loadFromString(tree.model)
     values = [_get_value(value, points, frame.waypoint) for value in tree.values]
-    placements = get_kinematics(model, cache).build_placements(ca.vertcat(*values))
+    own = KinematicTree(model, model)
+    placements = get_kinematics(own, cache).build_placements(ca.vertcat(*values), None)
     return base @ _to_matrix(placements[:, frame.joint - 1])
 
 
@@ -206,20 +210,22 @@ class TermProgram:
 
     def __init__(
         self,
-        model: pin.Model,
+        tree: KinematicTree,
         terms: tuple[TermRow, ...],
         z: Any,
         dt: Any,
+        mounts: Any,
         cache: Cache,
         width: int,
     ) -> None:
         """Assemble the terms.
 
         Args:
-            model: Model of the virtual kinematic chain.
+            tree: Joints of the virtual kinematic chain.
             terms: The terms.
             z: z_0..z_N as columns, shape (n, N + 1).
             dt: Step durations, shape (N, 1).
+            mounts: Placements of the mounted joints, see `KinematicTree.mounts`.
             cache: Cache of the functions.
             width: Number of variables per waypoint, z first.
         """
@@ -229,7 +235,6 @@ class TermProgram:
         self._hessians: list[tuple[ca.Function, list[Any], Ints, Ints, Any]] = []
         self.rows = 0
         self.rows_by_waypoint = [dict[int, Ints]() for _ in terms]
-        model_text = model.saveToString()
         self.cost: Any = ca.MX(0)
         values = [ca.MX(0, 1)]
         # nonzeros and positions of each kind of waypoint
@@ -240,19 +245,18 @@ class TermProgram:
         for term, rows_by_waypoint in zip(terms, self.rows_by_waypoint, strict=True):
             for (at, before), locations in _group_by_kind(term).items():
                 waypoint_count = len(locations[0][1])
-                key = ("term", model_text, term.formula, term.values, at, before, waypoint_count)
+                key = ("term", tree.key, term.formula, term.values, at, before, waypoint_count)
                 functions = cache.get(
                     key,
-                    functools.partial(
-                        TermFunctions, model, term, at, before, waypoint_count, cache
-                    ),
+                    functools.partial(TermFunctions, tree, term, at, before, waypoint_count, cache),
                 )
                 involved = np.array([waypoints for _, waypoints in locations])
                 steps = np.array([waypoint - 1 for waypoint, _ in locations])
                 points = ca.vertcat(*[z[:, columns.tolist()] for columns in involved.T])
-                inputs = [points, dt[steps.tolist()].T]
                 height = term.formula.rows
                 count = len(locations)
+                flat_mounts = ca.repmat(ca.vec(mounts), 1, count)
+                inputs = [points, dt[steps.tolist()].T, flat_mounts]
                 rows = self.rows + height * np.arange(count)[:, None] + np.arange(height)
                 value = ca.vec(functions.value.map(count)(*inputs))
                 row, column = functions.jacobian_pattern

@@ -17,7 +17,6 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from vkc_pin.planning.chain.inverse_kinematics import PoseSolver
 from vkc_pin.planning.chain.pose import POSE_OFFSET_SIZE
 from vkc_pin.planning.kinematics.machine_code import MachineCode
 from vkc_pin.planning.nlp.ipopt import BYTES_PER_ENTRY, Ipopt, make_ipopt
@@ -28,7 +27,6 @@ from vkc_pin.planning.nlp.waypoint import StepRows, Structure, get_waypoint_func
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.utils.budget import record_evaluations
 from vkc_pin.utils.cache import Cache
-from vkc_pin.world.models.coordinates import Coordinates
 
 
 class Transcription:
@@ -44,7 +42,6 @@ class Transcription:
         term_rows: For each user-defined term, waypoint → its rows; empty for costs.
         term_values: Function of x, z_0 and the step durations → values of these rows, their
             Jacobian, and the sum and gradient of the costs.
-        pose_solvers: Inverse kinematics of each pose.
         first_relaxed_row: First of the rows that do not come from waypoint functions: rolling,
             clamping and user-defined constraints.
         row_waypoints, rate_waypoints: Waypoint, counted from 0, whose relaxation variable widens
@@ -57,7 +54,7 @@ class Transcription:
     def __init__(self, structure: Structure, cache: Cache) -> None:
         self.structure = structure
         self.cache = cache
-        self.n = Coordinates(structure.model).size
+        self.n = structure.tree.coordinates.size
         self.segments = structure.segments
         self.slots = structure.slots
         self.width = self.n + self.slots + 1
@@ -67,19 +64,19 @@ class Transcription:
         for part in (self._make_objective, self._make_constraints, self._make_rates):
             record_evaluations()
             part()
-        self.pose_solvers = [PoseSolver(structure.model, pose, cache) for pose in structure.poses]
 
     @property
     def nbytes(self) -> int:
         """Estimated size in memory [bytes]."""
         nonzeros = self.jacobian.nnz() + self.hessian.nnz()
-        return BYTES_PER_ENTRY * nonzeros + sum(solver.nbytes for solver in self.pose_solvers)
+        return BYTES_PER_ENTRY * nonzeros
 
     def _make_symbols(self) -> None:
         n = self.n
         N = self.segments
         K = self.slots
-        joints = self.structure.model.njoints - 1
+        tree = self.structure.tree
+        joints = tree.model.njoints - 1
         poses = max(len(self.structure.poses), 1)
         self.x = ca.MX.sym("x", self.size)
         self.waypoint_variables = ca.reshape(self.x, self.width, N)  # one column per waypoint
@@ -88,6 +85,8 @@ class Transcription:
         self.planes = ca.MX.sym("C", K * 12 * joints, N)
         self.offsets = ca.MX.sym("R", K, N)
         self.targets = ca.MX.sym("W", 12, poses)
+        self.frames = ca.MX.sym("L", 12, poses)
+        self.mounts = ca.MX.sym("P", 12, tree.mount_count)
         self.pose_offsets = ca.MX.sym("D", POSE_OFFSET_SIZE * poses, N)
         self.penalty = ca.MX.sym("rho")
         self.relaxation_weights = ca.MX.sym("p", N)
@@ -102,7 +101,9 @@ class Transcription:
 
                 - start: z_0, shape (n,).
                 - planes, offsets: Witness planes C, shape (N, K, 12·joints), and R, shape (N, K).
-                - targets: Pose targets, shape (poses, 12).
+                - targets, frames: Targets of the poses, and placements of their frames on the
+                  joints, shape (poses, 12).
+                - mounts: Placements of the mounted joints, see `KinematicTree.mounts`.
                 - step_weights, change_weights: See `MotionCost.weights`.
                 - penalty: Penalty weight of the clearance slacks [1/m].
                 - pose_offsets: See `pose.compute_pose_offsets`, shape (N, poses, 7).
@@ -111,7 +112,12 @@ class Transcription:
                 - gears: Gear of a wheeled base in each step, shape (N,).
                 - dt: Step durations, shape (N,) [s].
         """
-        columns = {"planes": (0, 2, 1), "step_weights": (1, 0), "change_weights": (1, 0)}
+        columns = {
+            "planes": (0, 2, 1),
+            "step_weights": (1, 0),
+            "change_weights": (1, 0),
+            "mounts": (1, 0),
+        }
         parts = []
         for name, symbol in self.parameter_symbols.items():
             value = np.asarray(values.get(name, ()))
@@ -209,7 +215,7 @@ class Transcription:
         for poses in sorted(set(poses_at)):
             at = [t for t in range(N) if poses_at[t] == poses]
             pose_rows = tuple(self.structure.poses[k] for k in poses)
-            kind = get_waypoint_functions(self.structure.model, K, pose_rows, self.cache)
+            kind = get_waypoint_functions(self.structure.tree, K, pose_rows, self.cache)
             self.uncompiled_functions += kind.use_machine_code(len(at))
             inputs = self._select_inputs(poses, at)
             rows = first_row[at][:, None] + np.arange(kind.rows)
@@ -242,17 +248,20 @@ class Transcription:
     def _select_inputs(self, poses: tuple[int, ...], at: list[int]) -> list[ca.MX]:
         """Return the inputs of `WaypointFunctions` at waypoints (from 0), one column each.
 
-        Functions without poses take one unused target.
+        Functions without poses take one unused target and frame.
         """
         used = list(poses) or [0]
         offset_rows = [POSE_OFFSET_SIZE * k + i for k in used for i in range(POSE_OFFSET_SIZE)]
-        targets = ca.vec(self.targets[:, used])
+        constants = [self.targets[:, used], self.frames[:, used], self.mounts]
+        targets, frames, mounts = (ca.repmat(ca.vec(each), 1, len(at)) for each in constants)
         return [
             self.waypoint_variables[:, at],
             self.planes[:, at],
             self.offsets[:, at],
-            ca.repmat(targets, 1, len(at)),
+            targets,
             self.pose_offsets[offset_rows, at],
+            frames,
+            mounts,
         ]
 
     def _append_rows(self, values: ca.MX, jacobian: ca.MX, row_waypoints: Ints) -> ca.MX:
@@ -305,10 +314,11 @@ class Transcription:
         """Append the user-defined constraints and add the user-defined costs to the objective."""
         dt = self.dt if self.structure.is_timed else ca.MX.zeros(self.segments)
         part = TermProgram(
-            self.structure.model,
+            self.structure.tree,
             self.structure.terms,
             ca.horzcat(self.start, self.z),
             dt,
+            self.mounts,
             self.cache,
             self.width,
         )
@@ -317,7 +327,8 @@ class Transcription:
                 {waypoint: self.rows + rows for waypoint, rows in rows_by_waypoint.items()}
             )
         outputs = [part.values, part.jacobian, part.cost, part.gradient]
-        self.term_values = ca.Function("terms", [self.x, self.start, self.dt], outputs)
+        inputs = [self.x, self.start, self.dt, self.mounts]
+        self.term_values = ca.Function("terms", inputs, outputs)
         multipliers = self._append_rows(part.values, part.jacobian, part.row_waypoints)
         self.hessian = self.hessian + part.hessian(multipliers)
         self.f = self.f + part.cost
@@ -327,7 +338,7 @@ class Transcription:
     def _relax_remaining_rows(self) -> None:
         """Relax the rows that do not come from waypoint functions, and collect all parameters."""
         self.excess = ca.MX.sym("r", self.rows - self.first_relaxed_row)
-        inputs = [self.x, self.start, self.dt, self.gears]
+        inputs = [self.x, self.start, self.dt, self.gears, self.mounts]
         self.relaxed_row_values = ca.Function("others", inputs, [self.remaining_rows])
         if len(self.row_waypoints):
             rows = np.arange(self.first_relaxed_row, self.rows)
@@ -339,6 +350,8 @@ class Transcription:
             "planes": self.planes,
             "offsets": self.offsets,
             "targets": self.targets,
+            "frames": self.frames,
+            "mounts": self.mounts,
             "step_weights": self.step_weights,
             "change_weights": self.change_weights,
             "penalty": self.penalty,

@@ -11,9 +11,8 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-import pinocchio as pin
 
-from vkc_pin.planning.chain.chain import get_kinematics
+from vkc_pin.planning.chain.kinematic_tree import KinematicTree, get_kinematics
 from vkc_pin.planning.chain.pose import POSE_OFFSET_SIZE, PoseRow, build_pose_rows, relax_target
 from vkc_pin.planning.kinematics.batch import estimate_size
 from vkc_pin.planning.kinematics.machine_code import MachineCode
@@ -22,7 +21,6 @@ from vkc_pin.planning.nlp.term_rows import TermRow
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.utils.budget import record_evaluations
 from vkc_pin.utils.cache import Cache
-from vkc_pin.world.models.coordinates import Coordinates
 from vkc_pin.world.trajectory.wheels import OMNIDIRECTIONAL, RollingLimits
 
 # Minimum number of waypoints of one kind for which compilation pays off. Most kinds occur once, at
@@ -35,7 +33,7 @@ class Structure:
     """Everything that a symbolic program depends on.
 
     Attributes:
-        model: Model of the virtual kinematic chain.
+        tree: Joints of the virtual kinematic chain.
         segments: N, the number of waypoints after the start.
         poses: Frames with a pose goal.
         slots: K, witness planes per waypoint.
@@ -48,7 +46,7 @@ class Structure:
         terms: User-defined constraints and costs.
     """
 
-    model: pin.Model
+    tree: KinematicTree
     segments: int
     poses: tuple[PoseRow, ...]
     slots: int
@@ -66,28 +64,24 @@ class Structure:
     @cached_property
     def key(self) -> tuple[Any, ...]:
         """Cache key, equal for structures that share one program."""
-        poses = tuple((*_pose_key(pose), pose.waypoints) for pose in self.poses)
+        poses = tuple((*pose.key, pose.waypoints) for pose in self.poses)
         others = (self.stops, self.rolling, self.clamped, self.pushed, self.terms)
-        return (self.model.saveToString(), self.segments, poses, self.slots, *others)
-
-
-def _pose_key(pose: PoseRow) -> tuple[Any, ...]:
-    """Return a key that is equal for poses with the same constraint rows."""
-    return pose.joint, (pose.local.homogeneous + 0.0).tobytes(), pose.kind, pose.shift
+        return (self.tree.key, self.segments, poses, self.slots, *others)
 
 
 def get_waypoint_functions(
-    model: pin.Model, slots: int, poses: tuple[PoseRow, ...], cache: Cache
+    tree: KinematicTree, slots: int, poses: tuple[PoseRow, ...], cache: Cache
 ) -> WaypointFunctions:
     """Return the functions of one kind of waypoint, built if they are not in the cache."""
-    key = ("waypoint", model.saveToString(), slots, *(_pose_key(pose) for pose in poses))
-    return cache.get(key, lambda: WaypointFunctions(model, slots, poses, cache))
+    key = ("waypoint", tree.key, slots, *(pose.key for pose in poses))
+    return cache.get(key, lambda: WaypointFunctions(tree, slots, poses, cache))
 
 
 class WaypointFunctions:
-    """SX functions of one kind of waypoint: model, number of witness planes, and pose goals.
+    """SX functions of one kind of waypoint: tree, number of witness planes, and pose goals.
 
-    The variables are z, the slacks s and the relaxation e of the waypoint. Its rows are the witness
+    The variables are z, the slacks s and the relaxation e of the waypoint; the arguments beside
+    them are planes, targets, and placements of frames and mounted joints. Its rows are the witness
     planes C·vec(M(z)) − R + s, and for each pose goal `build_pose_rows` to the target relaxed by e.
 
     Attributes:
@@ -99,10 +93,10 @@ class WaypointFunctions:
     """
 
     def __init__(
-        self, model: pin.Model, slots: int, poses: tuple[PoseRow, ...], cache: Cache
+        self, tree: KinematicTree, slots: int, poses: tuple[PoseRow, ...], cache: Cache
     ) -> None:
-        n = Coordinates(model).size
-        joints = model.njoints - 1
+        n = tree.coordinates.size
+        joints = tree.model.njoints - 1
         z = ca.SX.sym("z", n)
         s = ca.SX.sym("s", slots)
         relaxation = ca.SX.sym("e")
@@ -110,16 +104,17 @@ class WaypointFunctions:
         offsets = ca.SX.sym("R", slots)
         targets = ca.SX.sym("W", 12, max(len(poses), 1))
         pose_offsets = ca.SX.sym("D", POSE_OFFSET_SIZE, max(len(poses), 1))
-        key = ("sweep", model.saveToString(), slots)
-        sweep = cache.get(key, lambda: _KinematicSweep(model, slots, cache))
-        placements, coordinate_jacobian = sweep.function(z, planes)
+        frames = ca.SX.sym("L", 12, max(len(poses), 1))
+        mounts = ca.SX.sym("P", 12, tree.mount_count)
+        sweep = cache.get(("sweep", tree.key, slots), lambda: _KinematicSweep(tree, slots, cache))
+        placements, coordinate_jacobian = sweep.function(z, mounts, planes)
         stacked = ca.vec(placements)
         # Every row is linear in the placements, rows = L·vec(M) + const, so one kinematic sweep
         # serves all of them.
         parts = []
         for k, pose in enumerate(poses):
             target = relax_target(targets[:, k], pose_offsets[:, k], relaxation)
-            rotation, translation = pose.build_placement(placements)
+            rotation, translation = pose.build_placement(placements, frames[:, k])
             parts.append(build_pose_rows(pose.kind, rotation, translation, target))
         pose_values = ca.vertcat(*parts) if parts else ca.SX(0, 1)
         self.pose_rows = [pose.rows for pose in poses]
@@ -137,10 +132,11 @@ class WaypointFunctions:
         w = ca.SX.sym("w", 12 * joints)
         lagrangian = ca.dot(w, stacked) + ca.dot(pose_multipliers, pose_values)
         hessian = ca.triu(ca.hessian(lagrangian, variables)[0])
-        given = [z, relaxation, targets, pose_offsets]
+        given = [z, relaxation, targets, pose_offsets, frames, mounts]
         inner = ca.Function("inner", [*given, w, multipliers], [hessian])
         hessian = inner(*given, planes.T @ plane_multipliers, multipliers)
-        inputs = [variables, ca.vec(planes), offsets, ca.vec(targets), ca.vec(pose_offsets)]
+        columns = [ca.vec(matrix) for matrix in (targets, pose_offsets, frames, mounts)]
+        inputs = [variables, ca.vec(planes), offsets, *columns]
         record_evaluations()
         self.value = ca.Function("g", inputs, [rows])
         self.jacobian = ca.Function("rows_jacobian", inputs, [ca.vertcat(*jacobian.nonzeros())])
@@ -272,21 +268,22 @@ class _StepFunctions:
 
 
 class _KinematicSweep:
-    """One kinematic sweep for all kinds of waypoints: (z, planes) → placements, plane gradients."""
+    """One kinematic sweep for all kinds of waypoints.
 
-    def __init__(self, model: pin.Model, slots: int, cache: Cache) -> None:
-        coordinates = Coordinates(model)
-        z = ca.SX.sym("z", coordinates.size)
-        planes = ca.SX.sym("C", slots, 12 * (model.njoints - 1))
-        placements = get_kinematics(model, cache).build_placements(z)
-        gradients = _differentiate_planes(model, coordinates, z, placements, planes)
-        self.function = ca.Function("sweep", [z, planes], [placements, gradients])
+    Its function is (z, mounts, planes) → placements, plane gradients.
+    """
+
+    def __init__(self, tree: KinematicTree, slots: int, cache: Cache) -> None:
+        z = ca.SX.sym("z", tree.coordinates.size)
+        mounts = ca.SX.sym("P", 12, tree.mount_count)
+        planes = ca.SX.sym("C", slots, 12 * (tree.model.njoints - 1))
+        placements = get_kinematics(tree, cache).build_placements(z, mounts)
+        gradients = _differentiate_planes(tree, z, placements, planes)
+        self.function = ca.Function("sweep", [z, mounts, planes], [placements, gradients])
         self.nbytes = estimate_size(self.function)
 
 
-def _differentiate_planes(
-    model: pin.Model, coordinates: Coordinates, z: Any, placements: Any, planes: Any
-) -> Any:
+def _differentiate_planes(tree: KinematicTree, z: Any, placements: Any, planes: Any) -> Any:
     """Return the derivatives of planes·vec(M(z)), shape (K, n), with respect to z.
 
     A coordinate of a joint moves everything that the joint supports by one twist (ω, v): dR = ω ×
@@ -295,6 +292,8 @@ def _differentiate_planes(
     work of multiplying by the derivatives of all placements. If a coordinate moves several joints,
     each contributes its twist relative to its nearest ancestor moved by the same coordinate.
     """
+    model = tree.model
+    coordinates = tree.coordinates
     forces: list[Any] = []
     moments: list[Any] = []
     axes = [slice(0, 3), slice(3, 6), slice(6, 9)]  # columns of R in a placement

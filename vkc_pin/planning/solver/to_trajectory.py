@@ -62,7 +62,7 @@ def close_chains(problem: TrajectoryProblem, points: Floats, at: Floats) -> Floa
     after = rows[np.ceil(at).astype(int)]
     robot = problem.chain.robot.coordinates.size
     closed = points.copy()
-    solvers = problem.transcription.pose_solvers
+    solvers = problem.pose_solvers
     for goal, solver in zip(problem.pose_goals, solvers, strict=True):
         if goal.kind != "closure":
             continue

@@ -16,7 +16,8 @@ from .planning.inverse_kinematics import inverse_kinematics
 from .planning.nlp.inspection import build
 from .planning.nlp.problem import TrajectoryProblem
 from .planning.plan import Plan
-from .planning.planner import Planner, plan
+from .planning.planner import Planner
+from .planning.prepare import PreparedTask, plan, prepare
 from .planning.scene_check import ReachableAttachment, SceneCheck, check_scene
 from .planning.solver.solution import Iteration
 from .simulation.physics import Physics
@@ -63,6 +64,7 @@ __all__ = [
     "PlacedObject",
     "Plan",
     "Planner",
+    "PreparedTask",
     "Reach",
     "ReachableAttachment",
     "Release",
@@ -95,6 +97,7 @@ __all__ = [
     "load_robot",
     "load_scene",
     "plan",
+    "prepare",
     "procedural",
     "simulation",
     "validate",

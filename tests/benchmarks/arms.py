@@ -18,7 +18,7 @@ from vkc_pin.importing.moveit_problems import Problem, list_problems, read_probl
 from vkc_pin.options import Options
 from vkc_pin.planning.initialization.keyframes import compute_shortfall
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.planner import plan
+from vkc_pin.planning.prepare import plan
 from vkc_pin.world.scene.clearance_exemptions import ACCEPTED_SHORTFALL, CONTACT_DEPTH
 from vkc_pin.world.task.steps import Configure, Reach, Step
 from vkc_pin.world.trajectory.trajectory import Trajectory

@@ -14,7 +14,7 @@ from vkc_pin.experiments.harness.record import Record, distribution, trial
 from vkc_pin.experiments.harness.runner import Execution
 from vkc_pin.experiments.harness.tables import JUDGED, count, format_table, join_sections, select
 from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.planner import plan
+from vkc_pin.planning.prepare import plan
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate
 

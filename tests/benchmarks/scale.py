@@ -27,7 +27,7 @@ from vkc_pin.experiments.harness.tables import (
 )
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.planner import plan
+from vkc_pin.planning.prepare import plan
 from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, use_style
 from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.world.scene.scene import Scene, load_scene

@@ -8,7 +8,7 @@ from helpers.datasets import SMALL
 
 from vkc_pin.datasets.episode import compute_scene_name, make_episode, run_attempt
 from vkc_pin.datasets.recipe import load_recipe
-from vkc_pin.planning.planner import plan
+from vkc_pin.planning.prepare import plan
 from vkc_pin.world.scene.scene import load_scene
 from vkc_pin.world.task.steps import Actuate
 

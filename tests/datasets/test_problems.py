@@ -10,7 +10,8 @@ from helpers.datasets import SMALL
 from vkc_pin.datasets.problems import NoProblemError, find_grasping_start, sample_problem
 from vkc_pin.datasets.recipe import load_recipe
 from vkc_pin.options import Options
-from vkc_pin.planning.planner import Planner, plan
+from vkc_pin.planning.planner import Planner
+from vkc_pin.planning.prepare import plan
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
 from vkc_pin.world.task.steps import Actuate, Grasp, Place, step_to_dict
 

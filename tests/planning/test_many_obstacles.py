@@ -14,7 +14,7 @@ from tests.benchmarks.scale import make_crowded_scene
 from vkc_pin.planning.chain.collision_pairs import PhaseGeometry
 from vkc_pin.planning.chain.contacts import ContactModel
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
-from vkc_pin.planning.planner import plan
+from vkc_pin.planning.prepare import plan
 from vkc_pin.world.collision.distances import count_distance_queries
 from vkc_pin.world.models.shapes import compute_shape_distance
 from vkc_pin.world.scene.obstacles import FLOOR

@@ -386,13 +386,13 @@ def test_step_that_begins_in_a_dead_end_is_planned_with_the_one_before() -> None
     """After the least motion that pulls the door open, the robot is behind it."""
     scene, options = vkc.load_scene("door"), vkc.Options()
     steps = [vkc.Actuate("door", {"hinge": -1.5}), vkc.GoTo(4.1, -0.3), vkc.GoTo(3.9, 0.3)]
-    request = PlanningRequest("auto", options, random_seed=1, is_draft=True)
+    request = PlanningRequest("auto", options, random_seed=1, wants_draft=True)
     first, last = plan_each_step(scene, compile_task(scene, steps, options), request)
     assert (first.first, first.last, last.first, last.last) == (0, 1, 2, 2)
     for part, names in ((first, ["reach", "turn", "move", "go"]), (last, ["go"])):
         assert part.result.is_solved
         assert [phase.name.split()[0] for phase in part.result.task.phases] == names
-    draft = first.result.plan.trajectory
+    draft = first.result.found.trajectory
     assert draft.column("door.hinge")[-1] == pytest.approx(-1.5, abs=1e-3)
     np.testing.assert_allclose(draft.positions[-1, :2], [4.1, -0.3], atol=1e-3)
 
@@ -414,7 +414,7 @@ def test_failed_step_stays_alone_if_its_holds_cannot_be_joined() -> None:
         vkc.Actuate("it", {"hinge_left": 0.2}, handle),
         vkc.Actuate("it", {"hinge_left": 0.8}, free),
     ]
-    request = PlanningRequest("auto", options, random_seed=1, is_draft=True)
+    request = PlanningRequest("auto", options, random_seed=1, wants_draft=True)
     parts = plan_each_step(scene, compile_task(scene, steps, options), request)
     assert [(part.first, part.last) for part in parts] == [(0, 0), (1, 1), (2, 2)]
     assert [part.result.is_solved for part in parts] == [True, True, False]

@@ -18,7 +18,7 @@ import vkc_pin as vkc
 from tests.benchmarks.problems.problem_set import problem as make_random_problem
 from vkc_pin.planning.initialization.initial_guess import InitialGuess
 from vkc_pin.planning.request import PlanningRequest
-from vkc_pin.planning.results import complete_draft
+from vkc_pin.planning.results import Draft
 from vkc_pin.planning.solve_task import TaskResult, solve_task
 from vkc_pin.world.task.compiler import compile_task
 
@@ -31,7 +31,7 @@ def test_draft_is_not_solved_from_a_deep_guess() -> None:
     scene, request = scene.with_start(base=(1.7, 1.2, -1.4)), PlanningRequest("auto", SHORT)
     task = compile_task(scene, [vkc.GoTo(4.1, -0.3)], SHORT)
     results = [
-        solve_task(scene, task, dataclasses.replace(request, is_draft=is_draft))
+        solve_task(scene, task, dataclasses.replace(request, wants_draft=is_draft))
         for is_draft in (False, True)
     ]
     assert [result.plan.metrics["rounds"] > 0 for result in results] == [True, False]
@@ -86,23 +86,25 @@ def test_user_guess_is_the_only_one() -> None:
     assert problems == [result.problem]
 
 
-def test_draft_is_no_success_until_it_is_retimed_and_validated() -> None:
-    request = PlanningRequest("auto", SHORT, is_draft=True)
+def test_draft_becomes_a_plan_when_it_is_retimed_and_validated() -> None:
+    request = PlanningRequest("auto", SHORT, wants_draft=True)
 
     def drive(x: float, request: PlanningRequest = request) -> TaskResult:
         return solve_task(
             make_hall(), compile_task(make_hall(), [vkc.GoTo(x, 0.0)], SHORT), request
         )
 
-    draft, expected = drive(1.0), drive(1.0, dataclasses.replace(request, is_draft=False)).plan
-    assert draft.is_solved
-    assert not draft.plan.success
-    found = complete_draft(draft.plan)
+    expected = drive(1.0, dataclasses.replace(request, wants_draft=False)).plan
+    result = drive(1.0)
+    draft = result.found
+    assert isinstance(draft, Draft)
+    assert result.is_solved
+    found = result.plan
     assert found.success, found.summary()
     np.testing.assert_array_equal(found.trajectory.times, expected.trajectory.times)
     assert found.report == expected.report
-    beside = dataclasses.replace(draft.plan, steps=(vkc.GoTo(1.0, 0.5),))
-    assert complete_draft(beside).status == "rejected"
+    beside = dataclasses.replace(draft, steps=(vkc.GoTo(1.0, 0.5),))
+    assert beside.complete().status == "rejected"
     infeasible = drive(30.0)
     assert (infeasible.is_solved, infeasible.plan.report.ok) == (False, False)
     assert infeasible.plan.status == "infeasible"

@@ -20,7 +20,8 @@ from vkc_pin.datasets.recipe import Recipe, load_recipe
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.planner import Planner, plan
+from vkc_pin.planning.planner import Planner
+from vkc_pin.planning.prepare import plan
 from vkc_pin.simulation.cameras import Images, render_images
 from vkc_pin.simulation.execution import simulate
 from vkc_pin.simulation.result import SimulationResult

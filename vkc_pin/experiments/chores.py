@@ -29,7 +29,7 @@ from vkc_pin.experiments.harness.tables import (
 )
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.planner import plan
+from vkc_pin.planning.prepare import plan
 from vkc_pin.procedural.rooms.clutter import add_clutter
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate, Grasp, Place, Step

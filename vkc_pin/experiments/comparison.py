@@ -44,7 +44,8 @@ from vkc_pin.experiments.harness.tables import (
     select,
 )
 from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.planner import Planner, plan
+from vkc_pin.planning.planner import Planner
+from vkc_pin.planning.prepare import plan
 from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.world.scene.poses import as_placement
 from vkc_pin.world.scene.scene import Scene, load_scene

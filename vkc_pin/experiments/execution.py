@@ -30,7 +30,7 @@ from vkc_pin.options import Options
 from vkc_pin.planning.initialization.keyframes import KeyframeSampler
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.planner import plan
+from vkc_pin.planning.prepare import plan
 from vkc_pin.simulation.execution import GRASPS, simulate
 from vkc_pin.simulation.physics import Physics, import_mujoco
 from vkc_pin.simulation.result import SimulationResult

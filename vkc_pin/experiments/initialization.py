@@ -25,7 +25,7 @@ from vkc_pin.experiments.harness.tables import (
     methods_table,
 )
 from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.planner import plan
+from vkc_pin.planning.prepare import plan
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Grasp, Touch
 

@@ -69,16 +69,16 @@ def try_alternatives(
             continue
         others.append(other)
         if other.is_solved:
-            every = [search.statistics, *(one.plan.statistics for one in others)]
-            return dataclasses.replace(other, plan=add_statistics(other.plan, every))
+            every = [search.statistics, *(one.found.statistics for one in others)]
+            return dataclasses.replace(other, found=add_statistics(other.found, every))
         reason = next(iter(other.plan.report.notes), other.plan.status)
         notes += [f"at {name}: {reason}"] * (reason not in STOP_STATUSES)
     if first is None:
         first = search.run()
         assert first is not None
     if first.is_solved or not (others or notes):
-        every = [search.statistics, *(one.plan.statistics for one in others)]
-        return dataclasses.replace(first, plan=add_statistics(first.plan, every))
+        every = [search.statistics, *(one.found.statistics for one in others)]
+        return dataclasses.replace(first, found=add_statistics(first.found, every))
     return _combine_failures(first, others, notes)
 
 
@@ -96,4 +96,4 @@ def _combine_failures(
     failed = dataclasses.replace(plan, report=report, status=current_ending() or status)
     total = add_statistics(failed, [one.statistics for one in every])
     is_blocked = all(one.is_goal_blocked for one in (first, *others))
-    return dataclasses.replace(first, plan=total, is_goal_blocked=is_blocked)
+    return dataclasses.replace(first, found=total, is_goal_blocked=is_blocked)

@@ -154,8 +154,6 @@ class Plan:
         history: One row per round of the solver.
         terms: Constraints and costs of the user, with their expressions as data.
         claimed: Report in the file that the plan was loaded from; else None.
-        is_validated: Whether `report` is this program's own; False for a plan that was loaded
-            without validation, whose report is its file's claim.
     """
 
     scene: Scene
@@ -171,7 +169,11 @@ class Plan:
     history: Sequence[Mapping[str, float]] = field(default_factory=tuple)
     terms: tuple[Term, ...] = ()
     claimed: Report | None = field(default=None, repr=False)
-    is_validated: bool = True
+
+    @property
+    def is_validated(self) -> bool:
+        """Whether `report` is this program's own, and not its file's claim."""
+        return self.report is not self.claimed
 
     @property
     def success(self) -> bool:
@@ -425,7 +427,6 @@ class Plan:
             history=tuple(saved.history),
             terms=tuple(term_from_dict(term) for term in saved.terms),
             claimed=claimed,
-            is_validated=False,
         )
 
 
@@ -438,7 +439,7 @@ def _revalidate(plan: Plan) -> Plan:
         report = replace(report, notes=claimed.notes)
         if status == "infeasible":
             report = report.with_reasons(claimed.violations or report.violations)
-    return replace(plan, report=report, status=status, is_validated=True)
+    return replace(plan, report=report, status=status)
 
 
 def _measure(plan: Plan) -> dict[str, float]:

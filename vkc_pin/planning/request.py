@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from vkc_pin.errors import InputError, format_value
 from vkc_pin.options import Options
 from vkc_pin.planning.initialization.methods import INITIALIZATIONS
+from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.progress import Progress
 from vkc_pin.planning.solver.solution import Iteration
 from vkc_pin.utils.arguments import (
@@ -21,7 +22,8 @@ from vkc_pin.utils.arguments import (
 from vkc_pin.utils.budget import Budget
 from vkc_pin.utils.cache import Cache
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.terms import Term, trace_terms
+from vkc_pin.world.task.terms import Term
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 DEFAULT_TIME_LIMIT = 60.0
 """Wall-clock limit of a planning call that gives no limit [s]."""
@@ -32,12 +34,12 @@ MAX_PERTURBATION = 3.0
 
 @dataclass(frozen=True)
 class PlanningRequest:
-    """Checked arguments of one planning call; see `planner.plan`.
+    """Checked arguments of one planning call; see `plan`.
 
     Attributes:
-        is_draft: Whether solutions of the nonlinear program are returned as they are, neither
-            retimed nor validated: initial guesses for a larger problem, whose solution is.
-        effort: Factor of the collision checks of searches with trees; see `planner.plan`.
+        guess: Motion from which the search starts, if any.
+        wants_draft: Whether a converged solution is returned as a `Draft`.
+        effort: Factor of the collision checks of searches with trees; see `plan`.
         is_tentative: Whether planning gives up if the goals of its first initial guess seem to be
             blocked, as steps before can be planned again with another grasp.
     """
@@ -51,7 +53,8 @@ class PlanningRequest:
     progress: Progress = field(default_factory=Progress)
     cache: Cache = field(default_factory=Cache)
     effort: int = 1
-    is_draft: bool = False
+    guess: Trajectory | None = None
+    wants_draft: bool = False
     is_tentative: bool = False
 
 
@@ -59,14 +62,14 @@ def make_request(
     scene: Scene,
     *,
     initialization: str,
-    options: Options | None,
+    options: Options,
     callback: Callable[[Iteration], None] | None,
     seed: int,
     perturbation: float = 0.0,
-    terms: Sequence[Term] = (),
+    guess: object = None,
+    terms: tuple[Term, ...] = (),
 ) -> PlanningRequest:
     """Return the arguments of `plan` as a request. Raises `InputError` for invalid ones."""
-    options = Options() if options is None else options
     check_arguments(scene, options, seed)
     check_choice(initialization, INITIALIZATIONS, "initialization", "initialization")
     noise = check_number(perturbation, "perturbation", "a number of at least 0", low=0.0)
@@ -77,8 +80,18 @@ def make_request(
         expected, got = "a function of an Iteration", format_value(callback)
         raise InputError("cannot be called", field="callback", expected=expected, got=got)
     return PlanningRequest(
-        initialization, options, callback, int(seed), noise, trace_terms(scene, terms)
+        initialization, options, callback, int(seed), noise, terms, guess=_get_motion(guess)
     )
+
+
+def _get_motion(guess: object) -> Trajectory | None:
+    """Return the motion of an initial guess. Raises `InputError`."""
+    if isinstance(guess, Plan):
+        return guess.trajectory
+    if guess is None or isinstance(guess, Trajectory):
+        return guess
+    expected = "a Plan or a Trajectory"
+    raise InputError("wrong type", field="guess", expected=expected, got=format_value(guess))
 
 
 def make_budget(time_limit: object, max_evaluations: object) -> Budget:

@@ -1,10 +1,12 @@
-"""Retimes and validates trajectories, and concatenates plans of consecutive steps."""
+"""Defines drafts, retimes and validates trajectories, and concatenates plans of steps."""
 
 from __future__ import annotations
 
 import dataclasses
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -29,8 +31,66 @@ FINAL = (*STOP_STATUSES, "infeasible")
 CURVELESS = ("torque", "support", "payload")
 """Constraints that do not depend on the curve between waypoints."""
 
+Found = TypeVar("Found", bound="Plan | Draft")
+
 MAX_REPAIRS = 3
 """Largest number of refinements; each brings the curve four times as close to the segments."""
+
+
+@dataclass(frozen=True, eq=False)
+class Draft:
+    """A solution of the nonlinear program of some steps, neither retimed nor validated.
+
+    It is an initial guess for a larger problem, whose solution is validated.
+
+    Attributes:
+        scene, steps, options: Scene, steps and options of planning.
+        trajectory: The waypoints of the solution, with the program's own times.
+        statistics: Times and counts of planning.
+        seed: Random seed.
+        initialization: Name of the initial guess it came from.
+        history: One row per round of the solver.
+        terms: Constraints and costs of the user.
+    """
+
+    scene: Scene
+    steps: tuple[Step, ...]
+    options: Options
+    trajectory: Trajectory
+    statistics: PlanningStatistics
+    seed: int
+    initialization: str
+    history: Sequence[Mapping[str, float]]
+    terms: tuple[Term, ...]
+
+    def complete(self) -> Plan:
+        """Return the plan: the trajectory retimed and validated."""
+        began = time.perf_counter()
+
+        def check(trajectory: Trajectory) -> Report:
+            return validate(self.scene, self.steps, trajectory, self.options, self.terms)
+
+        trajectory, report = retime_validated(
+            self.scene,
+            self.trajectory,
+            check,
+            jerk_time=self.options.jerk_time,
+            terms=self.terms,
+        )
+        took = PlanningStatistics(planning_time=time.perf_counter() - began)
+        return Plan(
+            self.scene,
+            self.steps,
+            self.options,
+            trajectory,
+            report,
+            "success" if report.ok else "rejected",
+            statistics=self.statistics + took,
+            seed=self.seed,
+            initialization=self.initialization,
+            history=self.history,
+            terms=self.terms,
+        )
 
 
 def sum_statistics(parts: Iterable[PlanningStatistics]) -> PlanningStatistics:
@@ -38,9 +98,9 @@ def sum_statistics(parts: Iterable[PlanningStatistics]) -> PlanningStatistics:
     return sum(parts, start=PlanningStatistics())
 
 
-def add_statistics(plan: Plan, parts: Iterable[PlanningStatistics]) -> Plan:
-    """Return a plan with the sum of the statistics of several plans."""
-    return dataclasses.replace(plan, statistics=sum_statistics(parts))
+def add_statistics(found: Found, parts: Iterable[PlanningStatistics]) -> Found:
+    """Return a plan or draft with the sum of the statistics of several."""
+    return dataclasses.replace(found, statistics=sum_statistics(parts))
 
 
 def concatenate_plans(
@@ -168,30 +228,3 @@ def retime_validated(
         trajectory = retime_trajectory(scene, waypoints, parts, jerk_time=jerk_time, close=close)
         report = check(trajectory)
     return trajectory, report
-
-
-def complete_draft(plan: Plan) -> Plan:
-    """Return a plan whose trajectory is retimed and validated, if it is not yet."""
-    if plan.is_validated:
-        return plan
-    start = time.perf_counter()
-
-    def check(trajectory: Trajectory) -> Report:
-        return validate(plan.scene, plan.steps, trajectory, plan.options, plan.terms)
-
-    trajectory, report = retime_validated(
-        plan.scene,
-        plan.trajectory,
-        check,
-        jerk_time=plan.options.jerk_time,
-        terms=plan.terms,
-    )
-    took = PlanningStatistics(planning_time=time.perf_counter() - start)
-    return dataclasses.replace(
-        plan,
-        trajectory=trajectory,
-        report=report,
-        status=plan.status if report.ok else "rejected",
-        statistics=plan.statistics + took,
-        is_validated=True,
-    )

@@ -13,7 +13,7 @@ from vkc_pin.planning.alternatives import try_alternatives
 from vkc_pin.planning.initialization.initial_guess import make_initial_guess
 from vkc_pin.planning.plan import Plan, PlanningStatistics
 from vkc_pin.planning.request import PlanningRequest
-from vkc_pin.planning.results import add_statistics, complete_draft, concatenate_plans
+from vkc_pin.planning.results import add_statistics, concatenate_plans
 from vkc_pin.planning.solve_task import TaskResult, TaskSearch, solve_task
 from vkc_pin.utils.budget import current_ending, reserve_time, share_budget
 from vkc_pin.world.scene.scene import Scene
@@ -91,9 +91,10 @@ def _plan_from_steps(scene: Scene, task: Task, request: PlanningRequest) -> tupl
         blocked. The concatenated solutions of the steps if one fails, or if they cannot be
         improved; a stationary plan, no success, if they are no one problem.
     """
-    parts = plan_each_step(scene, task, dataclasses.replace(request, is_draft=True))
-    steps, plans = _list_steps(task, parts), [part.result.plan for part in parts]
-    statistics, common = [plan.statistics for plan in plans], list[PlanningStatistics]()
+    parts = plan_each_step(scene, task, dataclasses.replace(request, wants_draft=True))
+    steps = _list_steps(task, parts)
+    statistics = [part.result.found.statistics for part in parts]
+    common = list[PlanningStatistics]()
     try:
         whole = task if steps == task.steps else compile_task(scene, steps, request.options)
     except InputError:
@@ -109,7 +110,7 @@ def _plan_from_steps(scene: Scene, task: Task, request: PlanningRequest) -> tupl
         common.append(plan.statistics)
         if plan.success:
             return add_statistics(plan, statistics + common), True
-    plans = [complete_draft(plan) for plan in plans]
+    plans = [part.result.plan for part in parts]
     statistics = [plan.statistics for plan in plans]
     plan = concatenate_plans(scene, steps, request, plans, statistics=statistics + common)
     return plan, bool(parts) and parts[-1].result.is_blocked_after(scene)
@@ -120,7 +121,7 @@ def _list_steps(task: Task, parts: Sequence[PlannedStep]) -> tuple[Step, ...]:
     steps: list[tuple[Step, ...]] = [(step,) for step in task.steps]
     for part in parts:  # one step becomes several where an object is grasped anew
         steps[part.first : part.last + 1] = [
-            part.result.plan.steps,
+            part.result.found.steps,
             *[()] * (part.last - part.first),
         ]
     return tuple(itertools.chain(*steps))
@@ -167,10 +168,10 @@ def _solve_alternative(scene: Scene, request: PlanningRequest, steps: Sequence[S
     task = compile_task(scene, steps, request.options)
     if find_shared_coordinate(scene, task.holds) is None:
         return solve_task(scene, task, request, check_goals_first=True)
-    request = dataclasses.replace(request, is_draft=False)
+    request = dataclasses.replace(request, wants_draft=False)
     results = [part.result for part in plan_each_step(scene, task, request)]
     plan = concatenate_plans(scene, steps, request, [result.plan for result in results])
-    return dataclasses.replace(results[-1], scene=scene, plan=plan)
+    return dataclasses.replace(results[-1], scene=scene, found=plan)
 
 
 def plan_each_step(scene: Scene, task: Task, request: PlanningRequest) -> list[PlannedStep]:
@@ -189,11 +190,11 @@ def plan_each_step(scene: Scene, task: Task, request: PlanningRequest) -> list[P
             continue
         request.progress.set_steps(number + 1, 1, len(task.steps))
         held = {hold.object for hold in current.holds}
-        is_tentative = request.is_draft and any(one.left_open & held for one in parts)
+        is_tentative = request.wants_draft and any(one.left_open & held for one in parts)
         trial = dataclasses.replace(request, is_tentative=is_tentative)
         result = solve_with_alternatives(current, own, trial, named=named)
         part = PlannedStep(number, number, result, _list_open_objects(own))
-        can_join = request.is_draft and parts
+        can_join = request.wants_draft and parts
         if can_join and not result.is_solved and not result.is_blocked_after(scene):
             joint = _join_steps(task, parts, part, request)
             if joint is not None:
@@ -207,7 +208,7 @@ def plan_each_step(scene: Scene, task: Task, request: PlanningRequest) -> list[P
             break
         reserved += result.check_time
         reserve_time("planned steps", reserved)
-        current = compute_final_scene(result.scene, result.plan.trajectory, result.task.after)
+        current = compute_final_scene(result.scene, result.found.trajectory, result.task.after)
     return parts
 
 
@@ -238,8 +239,8 @@ def _join_steps(
         return None
     result = solve_with_alternatives(scene, joint, request)
     results = [*replaced, failed.result, result]
-    plan = add_statistics(result.plan, [one.plan.statistics for one in results])
-    whole = dataclasses.replace(result, plan=plan)
+    found = add_statistics(result.found, [one.found.statistics for one in results])
+    whole = dataclasses.replace(result, found=found)
     return PlannedStep(first, failed.last, whole, _list_open_objects(joint))
 
 

@@ -33,6 +33,7 @@ from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.results import (
     CURVELESS,
     MAX_REPAIRS,
+    Draft,
     make_stationary_trajectory,
     retime_validated,
 )
@@ -72,17 +73,17 @@ class TaskResult:
 
     Attributes:
         scene: Scene in which it starts.
-        plan: The best plan found. That of a draft is not validated, unless solving failed.
+        found: The best plan found; a draft if the request wanted one and it converged.
         problem: The nonlinear program; None if the budget ended before it was built.
         z: Its best waypoints z_1..z_N, shape (N, n).
-        check_time: Time of the last validation [s]; for a draft, that it may take.
+        check_time: Time of the last validation [s]; of a draft, the one that it may take.
         is_grasp_independent: Whether the task fails for certain whatever the grasp.
         is_goal_blocked: Whether all configurations found at one of its goals are blocked.
     """
 
     scene: Scene
     task: Task
-    plan: Plan
+    found: Plan | Draft
     problem: TrajectoryProblem | None
     z: Floats
     check_time: float
@@ -91,8 +92,13 @@ class TaskResult:
 
     @property
     def is_solved(self) -> bool:
-        """Whether the plan is a success, or a draft of a converged solution."""
-        return self.plan.success or not self.plan.is_validated
+        """Whether it is a draft, or a plan that is a success."""
+        return isinstance(self.found, Draft) or self.found.success
+
+    @property
+    def plan(self) -> Plan:
+        """The plan; a draft is retimed and validated for it."""
+        return self.found.complete() if isinstance(self.found, Draft) else self.found
 
     def is_blocked_after(self, start: Scene) -> bool:
         """Return whether a goal is blocked however the steps from `start` to the task are done.
@@ -109,7 +115,7 @@ class TaskResult:
     def phase_waypoints(self) -> PhaseWaypoints:
         """Return the best waypoints, as an initial guess of problems with more phases."""
         assert self.problem is not None
-        return extract_phase_waypoints(self.problem, self.z, self.plan.initialization)
+        return extract_phase_waypoints(self.problem, self.z, self.found.initialization)
 
 
 def solve_task(
@@ -185,21 +191,35 @@ class TaskSearch:
         request, search = self._request, self._search
         if status in STOP_STATUSES:
             best = best.with_notes(_describe_shortfall(best.report))
-        plan = Plan(
-            self._scene,
-            self._task.steps,
-            request.options,
-            best.trajectory,
-            best.report,
-            status,
-            statistics=self.statistics,
-            seed=request.random_seed,
-            initialization=best.name,
-            is_optimized=best.is_optimized,
-            history=tuple(search.history),
-            terms=request.terms,
-            is_validated=best.is_validated,
-        )
+        history = tuple(search.history)
+        plan: Plan | Draft
+        if best.is_draft:
+            plan = Draft(
+                self._scene,
+                self._task.steps,
+                request.options,
+                best.trajectory,
+                self.statistics,
+                request.random_seed,
+                best.name,
+                history,
+                request.terms,
+            )
+        else:
+            plan = Plan(
+                self._scene,
+                self._task.steps,
+                request.options,
+                best.trajectory,
+                best.report,
+                status,
+                statistics=self.statistics,
+                seed=request.random_seed,
+                initialization=best.name,
+                is_optimized=best.is_optimized,
+                history=history,
+                terms=request.terms,
+            )
         found = best.problem, best.z, search.check_time
         causes = search.is_grasp_independent, search.is_goal_blocked
         return TaskResult(self._scene, self._task, plan, *found, *causes)
@@ -215,7 +235,7 @@ class _Candidate:
     trajectory: Trajectory
     report: Report
     status: PlanStatus
-    is_validated: bool = True
+    is_draft: bool = False
     is_optimized: bool = True
 
     @property
@@ -429,7 +449,7 @@ class _Search:
         if is_search and self._find_proofs(problem):
             best = self._make_stationary(problem)
             return best.with_notes(self._find_proofs(problem)), "infeasible"
-        if self.request.is_draft and not goals:  # deep guesses were not tried
+        if self.request.wants_draft and not goals:  # deep guesses were not tried
             goals = [goal for goal in self._find_blocked_goals(problem) if goal.is_deep]
         lines = [self._describe_goal(problem, goal) for goal in goals]
         self.is_goal_blocked = bool(lines)
@@ -438,7 +458,7 @@ class _Search:
         status = "infeasible" if lines else best.status
         if lines and nearest is None:
             lines = [*lines, *self._blocked_phases]
-        elif is_search and not lines and not self.request.is_draft:
+        elif is_search and not lines and not self.request.wants_draft:
             seed = self.request.random_seed
             lines, is_cut_off = diagnose_paths(
                 best.problem or problem, best.z, best.report, self._blocked_phases, seed
@@ -480,7 +500,7 @@ class _Search:
     def _generate_guesses(self, problem: TrajectoryProblem) -> Iterator[InitialGuess]:
         request = self.request
         # Where a step has only deep guesses, "auto" rather searches guesses for all steps together.
-        skips_deep = request.is_draft and request.initialization == "auto"
+        skips_deep = request.wants_draft and request.initialization == "auto"
         guesses = initialize(
             problem,
             request.initialization,
@@ -522,13 +542,15 @@ class _Search:
     ) -> _Candidate:
         """Retime and validate a solution; around violations the curve is refined.
 
-        A converged solution of a draft is left as it is, unless it is an initial guess.
+        If a draft is wanted, a converged solution is left as it is, unless it is an initial guess.
         """
         with suspend_budget():
             waypoints = make_trajectory(problem, solution.z, solution.dt)
-        if self.request.is_draft and solution.converged and is_optimized:
+        if self.request.wants_draft and solution.converged and is_optimized:
             self.check_time = _CHECK_TIME * problem.segments
-            return _Candidate(name, problem, solution.z, waypoints, Report(), "success", False)
+            return _Candidate(
+                name, problem, solution.z, waypoints, Report(), "success", is_draft=True
+            )
         began, validated = time.perf_counter(), self.times["validation"]
         # Violations of solutions that have not converged are not the curve's.
         trajectory, report = retime_validated(

@@ -24,7 +24,7 @@ from vkc_pin.experiments.harness.tables import (
 )
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.planner import plan
+from vkc_pin.planning.prepare import plan
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.optional_imports import import_optional
 

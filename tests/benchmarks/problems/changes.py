@@ -126,7 +126,7 @@ def _module(name: str) -> ModuleType:
 def _places(module: str, name: str) -> list[tuple[ModuleType, str]]:
     """Return (module, name) of all bindings of a constant."""
     # With it, all is imported that may import the constant.
-    importlib.import_module("vkc_pin.planning.planner")
+    importlib.import_module("vkc_pin.planning.prepare")
     home = _module(module)
     found = [(home, name)]
     for other in [

@@ -14,7 +14,7 @@ from vkc_pin.experiments.harness.record import distribution, trial
 from vkc_pin.experiments.harness.runner import LIMITS, Execution, describe_limit
 from vkc_pin.experiments.harness.tables import format_decimal, format_table, join_sections, select
 from vkc_pin.planning.diagnosis.proofs import PROVEN
-from vkc_pin.planning.planner import plan
+from vkc_pin.planning.prepare import plan
 from vkc_pin.procedural.rooms.random_room import sample_layout
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Step

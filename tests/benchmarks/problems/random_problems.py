@@ -26,7 +26,7 @@ from vkc_pin.experiments.harness.tables import (
     select,
 )
 from vkc_pin.options import Options
-from vkc_pin.planning.planner import plan
+from vkc_pin.planning.prepare import plan
 from vkc_pin.procedural.rooms.fixtures import OPENABLE
 from vkc_pin.procedural.rooms.random_room import random_room
 from vkc_pin.procedural.tasks import random_task

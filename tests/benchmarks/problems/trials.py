@@ -12,7 +12,8 @@ from vkc_pin.experiments.harness.record import trial
 from vkc_pin.experiments.harness.runner import LIMITS
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.planner import Planner, acquire_cache, plan
+from vkc_pin.planning.planner import Planner, acquire_cache
+from vkc_pin.planning.prepare import plan
 from vkc_pin.planning.solver.solution import Iteration
 from vkc_pin.world.scene.scene import Scene, load_scene
 from vkc_pin.world.task.compiler import compile_task

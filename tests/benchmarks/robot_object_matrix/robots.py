@@ -28,7 +28,7 @@ from vkc_pin.experiments.harness.tables import (
 from vkc_pin.importing.robots.rest_configuration import Clearances
 from vkc_pin.importing.robots.robot_import import import_robot
 from vkc_pin.options import Options
-from vkc_pin.planning.planner import plan
+from vkc_pin.planning.prepare import plan
 from vkc_pin.world.files.srdf import read_srdf
 from vkc_pin.world.files.writing import check_name
 from vkc_pin.world.models.robot import Robot

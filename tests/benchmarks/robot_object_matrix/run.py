@@ -21,7 +21,7 @@ from vkc_pin.experiments.harness.tables import (
     format_table,
     join_sections,
 )
-from vkc_pin.planning.planner import plan
+from vkc_pin.planning.prepare import plan
 from vkc_pin.visualization.plots.style import new_figure, save_figure, use_style
 from vkc_pin.world.models.robot_file import load_robot
 

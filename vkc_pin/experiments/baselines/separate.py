@@ -68,13 +68,13 @@ def plan_separately(
         scene: Robot, objects and obstacles.
         steps: Any number of `Actuate`, `Place`, `GoTo` and `Reach`.
         method: "B1" or "B2".
-        options: As for `planner.plan`.
+        options: As for `plan`.
         seed: Random seed.
-        time_limit: As for `planner.plan`.
-        max_evaluations: As for `planner.plan`; an iteration of inverse kinematics counts 1.
+        time_limit: As for `plan`.
+        max_evaluations: As for `plan`; an iteration of inverse kinematics counts 1.
         retries: Number of attempts, with other random numbers, until a motion is valid.
         finer: Factor of `Options.move_waypoints` for moving objects.
-        planner: As for `planner.plan`.
+        planner: As for `plan`.
 
     Returns:
         The plan of the first valid attempt, else of the one with most progress. Its status is then

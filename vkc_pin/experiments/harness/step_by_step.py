@@ -9,7 +9,7 @@ from vkc_pin.experiments.harness.record import trial
 from vkc_pin.experiments.harness.runner import LIMITS
 from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
-from vkc_pin.planning.planner import plan
+from vkc_pin.planning.prepare import plan
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Step
 

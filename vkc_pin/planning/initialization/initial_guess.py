@@ -12,6 +12,7 @@ from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.task.phases import PhaseKey
 from vkc_pin.world.trajectory.splicing import fill_missing_values
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 _DEEP = 0.1  # [m] penetration of a guess beyond which the solver seldom succeeds: 2 of 79
 # [m], [rad] initial trust region: a nearly feasible guess is improved in smaller steps
@@ -91,6 +92,40 @@ def make_initial_guess(problem: TrajectoryProblem, parts: Sequence[PhaseWaypoint
     z = np.where(np.isnan(z), problem.start, z)  # coordinates that no part moves
     name = ", ".join(part.initialization for part in parts) + ", then all at once"
     return InitialGuess(name, z, radius=np.full(problem.segments, _WARM_RADIUS))
+
+
+def make_guess_from_motion(problem: TrajectoryProblem, motion: Trajectory) -> InitialGuess:
+    """Make an initial guess from an earlier motion of the same steps, or of some of them.
+
+    A phase starts from the motion's next phase of the same name. Phases without one, and
+    coordinates that the motion lacks, stay where they were.
+    """
+    chain = problem.chain
+    known = [name for name in motion.names if name in chain.names]
+    columns = [chain.index(name) for name in known]
+    positions = motion.positions[:, [motion.names.index(name) for name in known]]
+    z = np.full((problem.segments, chain.size), np.nan)
+    after = 0  # number of the motion's next phase
+    begin = 0
+    for phase in problem.task.phases:
+        end = begin + phase.segments
+        for number, span in enumerate(motion.phases[after:], start=after):
+            if span.name == phase.name:
+                waypoints = _skip_pause(positions[span.first : span.last + 1])
+                z[begin:end, columns] = _resample(waypoints, phase.segments)
+                after = number + 1
+                break
+        begin = end
+    z = np.vstack([problem.start, z])
+    z = problem.clip(fill_missing_values(z)[1:])
+    return InitialGuess("given", z, radius=np.full(problem.segments, _WARM_RADIUS))
+
+
+def _skip_pause(waypoints: Floats) -> Floats:
+    """Return waypoints without those at the begin at which the gripper opens or closes."""
+    moves = np.flatnonzero(np.any(waypoints != waypoints[0], axis=1))
+    first = moves[0] - 1 if len(moves) else 0
+    return waypoints[first:]
 
 
 def _resample(waypoints: Floats, segments: int) -> Floats:

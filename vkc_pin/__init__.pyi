@@ -18,6 +18,7 @@ from .planning.nlp.problem import TrajectoryProblem
 from .planning.plan import Plan
 from .planning.planner import Planner
 from .planning.prepare import PreparedTask, plan, prepare
+from .planning.replan import replan
 from .planning.scene_check import ReachableAttachment, SceneCheck, check_scene
 from .planning.solver.solution import Iteration
 from .simulation.physics import Physics
@@ -99,6 +100,7 @@ __all__ = [
     "plan",
     "prepare",
     "procedural",
+    "replan",
     "simulation",
     "validate",
     "validation",

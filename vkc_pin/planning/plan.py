@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
-from vkc_pin.utils.arguments import check_bool, check_number
+from vkc_pin.planning.stopping import brake, list_steps_of_stop
+from vkc_pin.utils.arguments import check_bool, check_instance, check_number
 from vkc_pin.utils.arrays import replace_infinite
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import check_arguments, validate
@@ -32,6 +33,7 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import (
     compute_final_scene,
     compute_frame_placement,
+    compute_scene_at,
     find_coordinate_units,
 )
 
@@ -204,6 +206,59 @@ class Plan:
         after = compile_each_step(self.scene, self.steps, self.options)[-1].after
         return compute_final_scene(self.scene, self.trajectory, after)
 
+    def scene_at(self, time: float) -> Scene:
+        """Return the scene at a time of the motion [s], in which robot and objects are underway.
+
+        The robot has the motion's velocity. While the gripper closes or opens, it is the scene
+        before it did. To plan on from there, see `replan`.
+
+        Raises:
+            InputError: The time is outside the motion.
+        """
+        time = self.check_time(time)
+        there = compute_scene_at(self.scene, self.trajectory, time)
+        velocity = self.trajectory.velocity(time)[: self.trajectory.robot_size]
+        return there.with_start(velocity=velocity)
+
+    def stop(self, time: float, *, scene: Scene | None = None) -> Plan:
+        """Return a motion that brakes on this one's path as hard as the limits allow.
+
+        Args:
+            time: When braking begins [s].
+            scene: The world as it is at that time. Default: `scene_at(time)`.
+
+        Returns:
+            A plan whose motion counts from 0, validated in that scene: without success, something
+            is touched before it is at rest, or a torque limit exceeded.
+
+        Raises:
+            InputError: This plan is no success, or the time is outside its motion.
+        """
+        self.check_success()
+        time = self.check_time(time)
+        now = self.scene_at(time) if scene is None else check_instance(scene, Scene, "scene")
+        motion = brake(self.scene, self.trajectory, time, self.options)
+        steps = list_steps_of_stop(self.scene, motion)
+        report = validate(now, steps, motion, self.options)
+        status = "success" if report.ok else "rejected"
+        return Plan(now, steps, self.options, motion, report, status, initialization="stop")
+
+    def check_success(self) -> None:
+        """Raise an `InputError` unless the plan is a success."""
+        if not self.success:
+            problem, expected = "this plan is no success", "a motion that is valid"
+            raise InputError(problem, field="plan", expected=expected, got=self.status)
+
+    def check_time(self, time: float) -> float:
+        """Return a checked time of the motion [s].
+
+        Raises:
+            InputError: The time is outside the motion.
+        """
+        first, last = (float(self.trajectory.times[k]) for k in (0, -1))
+        expected = f"a time from {first:g} to {last:g} s"
+        return check_number(time, "time", expected, low=first, high=last)
+
     def simulate(self, **options: Any) -> SimulationResult:
         """Execute the trajectory in physics; see `simulation.simulate`. Extra: `sim`."""
         from vkc_pin.simulation.execution import simulate
@@ -222,9 +277,7 @@ class Plan:
             UnknownNameError: There is no such frame.
             InputError: The time is outside the motion.
         """
-        first, last = (float(self.trajectory.times[k]) for k in (0, -1))
-        expected = f"a time from {first:g} to {last:g} s"
-        time = check_number(time, "time", expected, low=first, high=last)
+        time = self.check_time(time)
         return compute_frame_placement(self.scene, self.trajectory, frame, time)
 
     def contradictions(self) -> list[str]:

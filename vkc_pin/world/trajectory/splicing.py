@@ -129,6 +129,31 @@ def fill_missing_values(table: Floats) -> Floats:
     return table
 
 
+def extract_times(trajectory: Trajectory, begin: float, end: float) -> Trajectory:
+    """Extract the part of a motion between two different times [s] inside it.
+
+    Phases without duration in between are left out. The times of the part are the original ones.
+    """
+    inside = trajectory.times[(trajectory.times > begin) & (trajectory.times < end)]
+    times = np.concatenate([[begin], inside, [end]])
+    spans = list[PhaseSpan]()
+    for phase in trajectory.phases:
+        first, last = np.clip(trajectory.times[[phase.first, phase.last]], begin, end)
+        if last > first:
+            rows = np.searchsorted(times, [first, last]).tolist()
+            spans.append(replace(phase, first=rows[0], last=rows[1]))
+    curve = trajectory.curve
+    positions = trajectory.at(times)
+    if curve is not None:
+        # A part of a cubic is the cubic with the same positions and velocities at its ends.
+        knots_inside = curve.times[(curve.times > begin) & (curve.times < end)]
+        knots = np.concatenate([[begin], knots_inside, [end]])
+        curve = Curve(knots, curve.at(knots), curve.velocity(knots))
+        positions = curve.positions[np.searchsorted(knots, times)]
+    names = trajectory.names
+    return Trajectory(names, times, positions, tuple(spans), trajectory.robot_size, curve)
+
+
 def extract_phases(
     trajectory: Trajectory, names: Sequence[str], begin: int, end: int | None
 ) -> Trajectory:

@@ -26,6 +26,7 @@ from vkc_pin.world.scene.contact_rules import compute_start_opening
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.free_objects import FreeObjects, to_free_joint_positions
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 FREE_JOINT = "placement"
@@ -266,21 +267,55 @@ def make_scene_at(scene: Scene, world: World, row: Floats, values: Mapping[str, 
 
 
 def compute_final_scene(scene: Scene, trajectory: Trajectory, holds: Sequence[Hold]) -> Scene:
-    """Compute the scene at the end of a motion."""
-    last = dict(zip(trajectory.names, trajectory.positions[-1].tolist(), strict=True))
+    """Compute the scene at the end of a motion, with the holds that remain."""
+    end = float(trajectory.times[-1])
+    return _compute_scene(scene, trajectory, end, holds, trajectory.phases[-1].opening)
+
+
+def compute_scene_at(scene: Scene, trajectory: Trajectory, time: float) -> Scene:
+    """Compute the scene at a time of a motion [s], with what is held there.
+
+    While the gripper closes or opens between two phases, it is the scene before it did.
+    """
+    phase = find_phase_at(trajectory, time)
+    return _compute_scene(scene, trajectory, time, phase.holds, phase.opening)
+
+
+def find_phase_at(trajectory: Trajectory, time: float) -> PhaseSpan:
+    """Return the phase at a time of a motion [s]; of a pause for the gripper, the one before."""
+    times = trajectory.times
+    before = trajectory.phases[0]
+    for phase in trajectory.phases:
+        is_pause = np.array_equal(*trajectory.positions[[phase.first, phase.first + 1]])
+        changes = phase.holds != before.holds or phase.opening != before.opening
+        begin = times[phase.first + 1] if is_pause and changes else times[phase.first]
+        if phase is not trajectory.phases[0] and time < begin:
+            break
+        before = phase
+    return before
+
+
+def _compute_scene(
+    scene: Scene,
+    trajectory: Trajectory,
+    time: float,
+    holds: Sequence[Hold],
+    opening: float | None,
+) -> Scene:
+    """Compute the scene at a time of a motion with given holds and gripper opening [m]."""
+    values = dict(zip(trajectory.names, trajectory.at(time).tolist(), strict=True))
     world = World(scene)
-    (row,) = world.compute_positions(trajectory, trajectory.times[-1:])
-    after = make_scene_at(scene, world, row, last)
-    final_holds = list[Hold]()
+    (row,) = world.compute_positions(trajectory, [time])
+    there = make_scene_at(scene, world, row, values)
+    holds_there = list[Hold]()
     for hold in holds:
         attachment = scene.objects[hold.object].object.attachment(hold.attachment)
         at = list[float]()
         for name, freedom in zip(attachment.coordinates, attachment.freedoms, strict=True):
-            value = last[f"{hold.object}.{name}"]
+            value = values[f"{hold.object}.{name}"]
             at.append(float(np.clip(value, freedom.lower, freedom.upper)))
-        final_holds.append(dataclasses.replace(hold, at=tuple(at)))
-    after = after.with_held(final_holds)
-    return dataclasses.replace(after, opening=trajectory.phases[-1].opening)
+        holds_there.append(dataclasses.replace(hold, at=tuple(at)))
+    return dataclasses.replace(there.with_held(holds_there), opening=opening)
 
 
 def find_coordinate_units(scene: Scene) -> dict[str, str]:

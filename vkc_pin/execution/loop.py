@@ -1,0 +1,281 @@
+"""Runs a plan on a robot: monitors it, plans the rest again when something differs, or brakes."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from vkc_pin.errors import InputError, format_value
+from vkc_pin.execution.monitor import Finding, Monitor
+from vkc_pin.execution.robots import Robot, RobotState
+from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.planner import Planner
+from vkc_pin.planning.prepare import prepare
+from vkc_pin.planning.replan import find_remaining_steps, replan
+from vkc_pin.utils.arguments import check_instance, check_number
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.steps import Step
+from vkc_pin.world.trajectory.trajectory import Trajectory
+
+Observe = Callable[[Scene], Scene]
+"""Puts what is known at present into a scene: placements of objects and obstacles."""
+
+Decision = Literal["go on", "replan", "brake", "wait", "stop"]
+"""What a cycle did: nothing; sent a new motion; braked on the path; stood still, since no motion
+was found yet; or gave up."""
+
+_DISTANCES = ("clearance", "penetration")
+_BRAKE_DELAY = 0.02  # [s] from the decision to brake to its begin, for sending the motion
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """What happened in one cycle.
+
+    Attributes:
+        time: Begin, on the robot's clock [s].
+        motion_time: Time of the motion that was being executed [s].
+        latency: Time from the measured state to the end of the cycle's work [s].
+        decision: See `Decision`.
+        reason: Why it was not "go on".
+    """
+
+    time: float
+    motion_time: float
+    latency: float
+    decision: Decision
+    reason: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class ExecutionResult:
+    """The record of an execution.
+
+    Attributes:
+        plan: The plan that it began with.
+        success: Whether the last motion carried out all steps, and the robot followed it.
+        reason: Why it ended without success; else "".
+        cycles: All cycles.
+        plans: Begin on the robot's clock [s] and plan of all motions that were sent.
+        late: Number of cycles that took longer than their period.
+    """
+
+    plan: Plan
+    success: bool
+    reason: str
+    cycles: tuple[Cycle, ...]
+    plans: tuple[tuple[float, Plan], ...]
+    late: int
+
+    def __repr__(self) -> str:
+        verdict = "success" if self.success else f"FAILED: {self.reason}"
+        counts = ", ".join(f"{n} × {name}" for name, n in self.count_decisions().items())
+        return f"<ExecutionResult {verdict}; {counts}>"
+
+    def count_decisions(self) -> dict[str, int]:
+        """Return decision → number of cycles."""
+        return dict(Counter(cycle.decision for cycle in self.cycles))
+
+
+def execute(
+    plan: Plan,
+    robot: Robot,
+    *,
+    rate: float = 20.0,
+    observe: Observe | None = None,
+    lead: float = 0.2,
+    patience: float = 10.0,
+    tracking: float = 0.02,
+    planner: Planner | None = None,
+) -> ExecutionResult:
+    """Execute a plan on a robot, and react to what differs from it.
+
+    In every cycle, the state of the robot is compared with the plan, and what is left of the motion
+    with the world as it is known then. If an object is elsewhere, an obstacle in the way, or the
+    robot off its motion, the rest is planned again, to begin `lead` seconds later, while the robot
+    goes on. If no new motion is there in time, the robot brakes on its path, and plans from rest.
+
+    Args:
+        plan: A successful plan, in whose start the robot stands.
+        robot: The robot.
+        rate: Cycles per second [Hz].
+        observe: Puts what is known at present into a scene. Default: nothing changes.
+        lead: Time from a decision to the begin of the new motion, within which it must be found
+            [s].
+        patience: Longest time at rest without a motion before execution fails [s].
+        tracking: Largest accepted distance from the planned configuration, [m] and [rad].
+        planner: Planner whose caches are used.
+
+    Raises:
+        InputError: The plan is no success, the robot is not at its start, or an argument is
+            invalid.
+    """
+    check_instance(plan, Plan, "plan").check_success()
+    if not isinstance(robot, Robot):
+        expected = "an object with the methods of `Robot`"
+        raise InputError("no robot", field="robot", expected=expected, got=format_value(robot))
+    if observe is not None and not callable(observe):
+        expected, got = "a function of a Scene", format_value(observe)
+        raise InputError("cannot be called", field="observe", expected=expected, got=got)
+    period = 1.0 / check_number(rate, "rate", "cycles per second", low=0.1, high=1000.0)
+    lead = check_number(lead, "lead", "a time [s]", low=period)
+    patience = check_number(patience, "patience", "a time [s]", low=0.0)
+    loop = _Loop(plan, robot, period, observe, lead, patience, tracking, planner)
+    return loop.run()
+
+
+class _Loop:
+    """State of an execution."""
+
+    def __init__(
+        self,
+        plan: Plan,
+        robot: Robot,
+        period: float,
+        observe: Observe | None,
+        lead: float,
+        patience: float,
+        tracking: float,
+        planner: Planner | None,
+    ) -> None:
+        self._first = plan
+        self._robot = robot
+        self._period = period
+        self._observe = observe
+        self._lead = lead
+        self._patience = patience
+        self._tracking = tracking
+        self._planner = planner
+        self._cycles = list[Cycle]()
+        self._sent = list[tuple[float, Plan]]()
+        # While the robot brakes or stands, the steps that are left, and the motion to guess from.
+        self._waiting: tuple[tuple[Step, ...], Trajectory] | None = None
+        self._rest_since = 0.0
+        self._late = 0
+
+    def run(self) -> ExecutionResult:
+        state = self._robot.read()
+        monitor = Monitor(self._first, tracking=self._tracking)
+        finding = monitor.check(float(self._first.trajectory.times[0]), state, None)
+        if finding.reason:
+            expected = "a robot at the start of the plan"
+            raise InputError("not at its start", field="robot", expected=expected, got=finding.reason)
+        self._send(self._first, state.time + self._period)
+        next_cycle = state.time + self._period
+        reason = ""
+        while not reason:
+            self._robot.wait(next_cycle)
+            state = self._robot.read()
+            began = time.perf_counter()
+            decision, why = self._decide(state)
+            latency = time.perf_counter() - began
+            motion_time = self._get_motion_time(state.time)
+            self._cycles.append(Cycle(state.time, motion_time, latency, decision, why))
+            self._late += latency > self._period
+            if decision == "stop":
+                reason = why
+            elif self._is_done(state.time):
+                break
+            next_cycle = max(next_cycle + self._period, state.time)
+        return ExecutionResult(
+            self._first, not reason, reason, tuple(self._cycles), tuple(self._sent), self._late
+        )
+
+    @property
+    def _plan(self) -> Plan:
+        return self._sent[-1][1]
+
+    def _get_motion_time(self, now: float) -> float:
+        """Return the time of the present motion at a time of the robot's clock [s]."""
+        begin, plan = self._sent[-1]
+        first = float(plan.trajectory.times[0])
+        return min(max(now - begin + first, first), float(plan.trajectory.times[-1]))
+
+    def _is_done(self, now: float) -> bool:
+        begin, plan = self._sent[-1]
+        return self._waiting is None and now - begin >= float(plan.trajectory.times[-1])
+
+    def _send(self, plan: Plan, begin: float) -> None:
+        self._robot.send(plan.trajectory, begin)
+        self._sent.append((begin, plan))
+        self._monitor = Monitor(plan, tracking=self._tracking)
+
+    def _look(self, scene: Scene) -> Scene:
+        """Return a scene with what is known at present."""
+        return scene if self._observe is None else self._observe(scene)
+
+    def _decide(self, state: RobotState) -> tuple[Decision, str]:
+        begin, plan = self._sent[-1]
+        if state.time < begin:
+            return "go on", ""  # a motion has been sent that has not begun
+        now = self._get_motion_time(state.time)
+        scene = None if self._observe is None else self._look(plan.scene)
+        finding = self._monitor.check(now, state, scene)
+        if self._waiting is not None:
+            return self._plan_from_rest(state, self._waiting)
+        if not finding.reason:
+            return "go on", ""
+        return self._react(state, now, finding)
+
+    def _react(self, state: RobotState, now: float, finding: Finding) -> tuple[Decision, str]:
+        """Plan the rest again, or brake."""
+        plan = self._plan
+        takeover = now + self._lead
+        if takeover < float(plan.trajectory.times[-1]):
+            scene = self._look(plan.scene_at(takeover))
+            try:
+                found = replan(
+                    plan, takeover, scene=scene, time_limit=self._lead, planner=self._planner
+                )
+            except InputError as error:  # the steps are impossible there
+                return self._brake(now, f"{finding.reason}; {error}")
+            at = state.time + self._lead
+            if found.success and self._robot.read().time < at:
+                self._send(found, at)
+                return "replan", finding.reason
+            finding = Finding(f"{finding.reason}; {found.status}", finding.time)
+        return self._brake(now, finding.reason)
+
+    def _brake(self, now: float, reason: str) -> tuple[Decision, str]:
+        """Send a braking motion on the path."""
+        begin, plan = self._sent[-1]
+        clock = self._robot.read().time + _BRAKE_DELAY
+        motion_time = self._get_motion_time(clock)
+        try:
+            steps = find_remaining_steps(plan, motion_time)
+        except InputError:
+            return "stop", reason
+        stop = plan.stop(motion_time, scene=self._look(plan.scene_at(motion_time)))
+        # If something will be touched all the same, nothing is better than to brake.
+        others = [one for one in stop.report.violations if one.constraint not in _DISTANCES]
+        if others:
+            self._robot.stop()
+            return "stop", f"{reason}; braking fails: {others[0].text}"
+        self._waiting = (steps, plan.trajectory)
+        self._robot.send(stop.trajectory, clock)
+        self._sent.append((clock, stop))
+        self._monitor = Monitor(stop, tracking=self._tracking)
+        self._rest_since = clock + float(stop.trajectory.times[-1])
+        return "brake", reason
+
+    def _plan_from_rest(
+        self, state: RobotState, waiting: tuple[tuple[Step, ...], Trajectory]
+    ) -> tuple[Decision, str]:
+        """Plan the remaining steps from where the robot stands, once it does."""
+        if state.time < self._rest_since:
+            return "wait", "braking"
+        steps, guess = waiting
+        if state.time > self._rest_since + self._patience:
+            return "stop", "no motion was found from rest"
+        end = float(self._plan.trajectory.times[-1])
+        scene = self._look(self._plan.scene_at(end))
+        prepared = prepare(scene, steps, options=self._first.options, planner=self._planner)
+        found = prepared.solve(guess=guess, time_limit=max(self._lead, 1.0))
+        if not found.success:
+            return "wait", found.status
+        self._waiting = None
+        self._send(found, self._robot.read().time + _BRAKE_DELAY)
+        return "replan", "from rest"

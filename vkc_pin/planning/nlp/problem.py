@@ -207,7 +207,9 @@ class TrajectoryProblem:
         robot_velocity = self.scene.start_velocity
         if not robot_velocity.any():
             return velocities
-        if self.task.phases[0].released:
+        first_phase = self.task.phases[0]
+        stands_still = first_phase.kind == "stand" and not self.is_closed(first_phase)
+        if first_phase.released or stands_still:
             raise InputError(
                 "the robot cannot move where its hand opens",
                 field="start.velocity",

@@ -49,8 +49,8 @@ class ProgramPoint:
     @property
     def parameters(self) -> np.ndarray:
         p = self.problem
-        values = p.parameters_at(self.z)
-        values |= {"gears": self.gears, "dt": self.dt, "planes": self.planes}
+        values = p.parameters_at(self.z, self.dt)
+        values |= {"gears": self.gears, "planes": self.planes}
         values |= dict(zip(("step_weights", "change_weights"), self.weights, strict=True))
         vector = p.transcription.parameter_vector(
             offsets=self.offsets,
@@ -134,7 +134,7 @@ def make_random_point(p: TrajectoryProblem, seed: int = 0) -> ProgramPoint:
         excess=rng.normal(size=t.rows - t.first_relaxed_row),
         rate_excess=rng.normal(size=t.rate_matrix.size1()),
         relaxation_weights=rng.uniform(0.0, 50.0, N),
-        weights=tuple(rng.uniform(0.1, 3.0, part.shape) for part in p.rates(p.still)),
+        weights=tuple(rng.uniform(0.1, 3.0, part.shape) for part in p.rates(p.still, np.ones(N))),
         dt=rng.uniform(0.1, 0.4, N),
         gears=np.where(np.arange(N) % 2, 1.0, -1.0),
     )

@@ -37,8 +37,8 @@ class RelaxedProgram:
         p = self.problem
         f = self.found
         planes, offsets = self._planes
-        values = {"planes": planes, "offsets": offsets, "penalty": CLEARANCE, "dt": self.timing.dt}
-        values |= p.parameters_at(self.z)
+        values = {"planes": planes, "offsets": offsets, "penalty": CLEARANCE}
+        values |= p.parameters_at(self.z, self.timing.dt)
         rate_excess = np.zeros(len(f.rate_excess))
         if relaxed:
             values |= {"pose_offsets": f.pose_offsets, "excess": f.excess}
@@ -58,7 +58,7 @@ class RelaxedProgram:
 
     def quadratic_cost(self) -> float:
         """Return the motion cost according to the quadratic model in the program."""
-        rates = self.problem.rates(self.z)
+        rates = self.problem.rates(self.z, self.timing.dt)
         return float(
             sum(
                 np.sum(w * part**2)

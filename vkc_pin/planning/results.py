@@ -6,6 +6,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -14,6 +15,7 @@ from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan, PlanningStatistics
 from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.retiming.retime import Close, retime_trajectory
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.budget import STOP_STATUSES, current_ending
 from vkc_pin.validation.report import Report
 from vkc_pin.validation.validate import validate
@@ -205,6 +207,7 @@ def retime_validated(
     jerk_time: float = 0.0,
     terms: Sequence[Term] = (),
     close: Close | None = None,
+    end_velocities: Floats | None = None,
 ) -> tuple[Trajectory, Report]:
     """Return a trajectory through waypoints and its report; the last one if none is valid.
 
@@ -212,12 +215,15 @@ def retime_validated(
     which the program has checked, with chains closed by `close`. Violations that depend on no curve
     are left alone. `check` validates a trajectory, and `repairs` is the largest number of
     refinements. If one of the user's traced `terms` depends on velocities, the program's own times
-    are kept.
+    are kept. For `end_velocities` see `retime_trajectory`.
     """
+    retime = partial(
+        retime_trajectory, scene, waypoints, jerk_time=jerk_time, end_velocities=end_velocities
+    )
     if any(term.formula.uses_previous for term in terms):
         return waypoints, check(waypoints)
     parts = np.ones(len(waypoints.times) - 1, int)
-    trajectory = retime_trajectory(scene, waypoints, jerk_time=jerk_time)
+    trajectory = retime()
     report = check(trajectory)
     for _ in range(repairs):
         wrong = [one.waypoint for one in report.violations if one.constraint not in CURVELESS]
@@ -225,6 +231,6 @@ def retime_validated(
         if not near:
             break
         parts[[k for k in near if 0 <= k < len(parts)]] *= 2
-        trajectory = retime_trajectory(scene, waypoints, parts, jerk_time=jerk_time, close=close)
+        trajectory = retime(parts, close=close)
         report = check(trajectory)
     return trajectory, report

@@ -561,6 +561,7 @@ class _Search:
             jerk_time=self.request.options.jerk_time,
             terms=self.request.terms,
             close=partial(close_chains, problem),
+            end_velocities=problem.end_velocities,
         )
         took = time.perf_counter() - began
         self.times["retiming"] += took - (self.times["validation"] - validated)

@@ -93,7 +93,8 @@ def compute_objective(found: Plan, planner: Planner | None = None) -> float | No
             return None
         freedoms = {name for names in problem.chain.virtual.values() for name in names}
         counted = np.array([name not in freedoms for name in problem.chain.names])
-        first, second = problem.rates(found.trajectory.positions[rows])
+        dt = np.full(problem.segments, problem.options.dt)
+        first, second = problem.rates(found.trajectory.positions[rows], dt)
         return problem.motion_cost.value(first * counted, second * counted)
 
 

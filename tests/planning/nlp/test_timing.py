@@ -57,7 +57,7 @@ def compute_differences(
 def test_runs_are_stretched_as_needed_up_to_a_limit(seed: int, size: float) -> None:
     rng, runs = np.random.default_rng(seed), [(0, 5), (5, 6), (6, 12)]
     limits, dt = (np.full(3, 1.0), np.full(3, 4.0)), np.repeat([0.5, 1.0, 0.8], [5, 1, 6])
-    timing = Timing(dt, dt, runs, limits)
+    timing = Timing(dt, dt, runs, limits, np.zeros((2, 3)))
     first, second = compute_differences(
         np.cumsum(0.5 * size * rng.uniform(-0.5, 0.5, (13, 3)), axis=0), runs
     )

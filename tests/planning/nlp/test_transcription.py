@@ -149,7 +149,7 @@ def test_rows_equal_their_definitions(name: str) -> None:
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-9)
     owners = np.concatenate([t.row_waypoints, t.rate_waypoints])
     np.testing.assert_array_equal(owners, waypoints - 1)
-    steps, bends = p.rates(point.z)
+    steps, bends = p.rates(point.z, point.dt)
     rates = values[t.rows - t.first_relaxed_row :]
     np.testing.assert_allclose(np.r_[steps.ravel(), bends.ravel()], rates, atol=1e-12)
     squares = [np.sum(w * part**2) for w, part in zip(point.weights, (steps, bends), strict=True)]

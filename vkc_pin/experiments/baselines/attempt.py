@@ -243,8 +243,9 @@ class Attempt:
                 continue
             began = time.perf_counter()
             followed = follow(problem, base, self.rng, refine=self.refine)
-            pace = problem.pace(followed.z)
-            timing = problem.timing_for(followed.z).stretch(*pace)
+            timing = problem.timing_for(followed.z)
+            timing = timing.stretch(*problem.pace(followed.z, timing.dt))
+            pace = problem.pace(followed.z, timing.dt)
             self.times["following"] += time.perf_counter() - began
             cause = followed.cause
             if not cause and timing.compute_violation(*pace) > TOLERANCE:

@@ -89,8 +89,7 @@ def planes(problem: TrajectoryProblem, z: Floats, waypoint: int) -> list[Plane]:
         planes=coefficients,
         offsets=offsets,
         penalty=problem.options.penalty,
-        dt=problem.timing_for(z).dt,
-        **problem.parameters_at(z),
+        **problem.parameters_at(z, problem.timing_for(z).dt),
     )
     slopes = ca.Function("slopes", [t.x, t.parameters], [t.jacobian])
     jacobian = slopes(t.pack(z), parameters).sparse().tocsr()
@@ -122,7 +121,8 @@ def sizes(problem: TrajectoryProblem) -> dict[str, int]:
     The velocity and acceleration rows are part of the program only if it turns out to need them.
     """
     t = problem.transcription
-    velocities, accelerations = problem.rates(problem.still)
+    dt = np.full(problem.segments, problem.options.dt)
+    velocities, accelerations = problem.rates(problem.still, dt)
     fixed = int((problem.lower == problem.upper).sum())
     counts = {
         "variables: coordinates": problem.lower.size - fixed,

@@ -84,7 +84,7 @@ def measure_infeasibility(
         np.add.at(amounts[kind], t.row_waypoints, scale * np.abs(excess))
     rate_excess = np.zeros(0)
     if rates:
-        steps, changes = problem.rates(z)
+        steps, changes = problem.rates(z, timing.dt)
         values = np.concatenate([steps.ravel(), changes.ravel()])
         bound = np.concatenate([timing.velocity.ravel(), timing.acceleration.ravel()])
         rate_excess = values - np.clip(values, -bound, bound)

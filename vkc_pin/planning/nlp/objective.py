@@ -21,7 +21,7 @@ def find_change_steps(stops: Sequence[int], segments: int) -> list[int]:
     """
     steps = list[int]()
     for begin, end in itertools.pairwise([0, *stops, segments]):
-        # The first change of a run is from rest to its first step.
+        # The first change of a run is to its first step, from rest or from the start velocity.
         waypoints = range(begin, end + 1)
         steps += [max(waypoint, 1) - 1 for waypoint in waypoints]
     return steps
@@ -38,13 +38,13 @@ class MotionCost:
     group g: x and y of the base form one group, every other coordinate is a group of its own. At
     constant speed √(m_p·E_pg) is the path length of g, so that slow motion is not cheap, and a
     phase with fewer steps does not cost more. Except for ε, f is a sum of norms; it is convex. See
-    `sparse.make_differences` for the changes.
+    `sparse.Differences` for the changes.
 
     Args:
         metric: Diagonal of W, shape (n,), [1/m²] and [1/rad²].
         smoothing: κ.
         ends: Last waypoint of each phase, shape (P,).
-        stops: Interior waypoints at which the motion is at rest, as it is at its start and end.
+        stops: Interior waypoints at which the motion is at rest.
         length: Whether the cost is the path length; otherwise it is the sum of squares.
     """
 

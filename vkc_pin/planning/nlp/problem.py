@@ -9,6 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
+from vkc_pin.errors import InputError
 from vkc_pin.options import Options
 from vkc_pin.planning.chain.chain import VirtualKinematicChain, consolidate
 from vkc_pin.planning.chain.contacts import ContactModel, Contacts
@@ -26,7 +27,12 @@ from vkc_pin.planning.nlp.pose_goals import (
 )
 from vkc_pin.planning.nlp.term_locations import TermEvaluator, locate_terms
 from vkc_pin.planning.nlp.term_rows import TermRow
-from vkc_pin.planning.nlp.timing import Timing, compute_step_times, split_at_stops
+from vkc_pin.planning.nlp.timing import (
+    Timing,
+    compute_end_steps,
+    compute_step_times,
+    split_at_stops,
+)
 from vkc_pin.planning.nlp.transcription import transcribe
 from vkc_pin.planning.nlp.waypoint import Structure
 from vkc_pin.utils.arrays import Floats
@@ -43,6 +49,8 @@ from vkc_pin.world.trajectory.wheels import make_rolling_limits
 # regularises the problem.
 _CHOSEN_FREEDOM_WEIGHT = 1e-4
 _TOLERANCES = Tolerances()
+# [m/s], [rad/s] with which a start velocity may open the closure of a grasped object
+_MAX_CLOSURE_SPEED = 1e-3
 
 
 class TrajectoryProblem:
@@ -58,6 +66,7 @@ class TrajectoryProblem:
         transcription: Symbolic program, shared between problems of one structure.
         motion_cost: Cost of the motion.
         start: z_0, shape (n,).
+        end_velocities: Velocities at the start and the end of the motion, shape (2, n).
         lower, upper: Bounds of z_1..z_N, shape (N, n): joint limits (eq. 4), fixed coordinates,
             joint goals.
         pose_goals: Pose goals (eqs. 2 and 3), one for each of `transcription.structure.poses`.
@@ -100,8 +109,10 @@ class TrajectoryProblem:
         )
         self.motion_cost = self._make_motion_cost()
         self.start = self._make_start()
+        self.end_velocities = self._make_end_velocities()
         self.lower, self.upper = self._make_bounds()
         self.start.setflags(write=False)
+        self.end_velocities.setflags(write=False)
         self.lower.setflags(write=False)
         self.upper.setflags(write=False)
         self.term_evaluator = TermEvaluator(
@@ -186,6 +197,46 @@ class TrajectoryProblem:
                 start[self.chain.index(f"{hold.object}.{name}")] = value
         return start
 
+    def _make_end_velocities(self) -> Floats:
+        """Return the velocities at the start, as the scene states it, and at the end: at rest.
+
+        A grasped object that is fixed in the world moves with the hand: with the Jacobians J_r and
+        J_o of the closures' residuals, J_o·v_o = −J_r·v_r.
+        """
+        velocities = np.zeros((2, self.chain.size))
+        robot_velocity = self.scene.start_velocity
+        if not robot_velocity.any():
+            return velocities
+        first_phase = self.task.phases[0]
+        stands_still = first_phase.kind == "stand" and not self.is_closed(first_phase)
+        if first_phase.released or stands_still:
+            raise InputError(
+                "the robot cannot move where its hand opens",
+                field="start.velocity",
+                expected="a start at rest, or a task that does not begin with a release",
+            )
+        size = len(robot_velocity)
+        velocities[0, :size] = robot_velocity
+        jacobians = [np.zeros((0, self.chain.size))]
+        held = {hold.object for hold in self._continued_holds}
+        for goal, solver in zip(self.pose_goals, self.pose_solvers, strict=True):
+            if goal.kind == "closure" and goal.object in held:
+                _, jacobian = solver.evaluate(self.start[None], goal.target)
+                jacobians.append(jacobian[0])
+        jacobian = np.concatenate(jacobians)
+        hand_velocity = jacobian[:, :size] @ robot_velocity
+        others, *_ = np.linalg.lstsq(jacobian[:, size:], -hand_velocity, rcond=1e-9)
+        remainder = hand_velocity + jacobian[:, size:] @ others
+        if np.abs(remainder).max(initial=0.0) > _MAX_CLOSURE_SPEED:
+            raise InputError(
+                "the grasped object cannot follow the hand",
+                field="start.velocity",
+                expected="a velocity along the joints of the grasped object",
+                got=f"{np.abs(remainder).max():.3g} m/s or rad/s off them",
+            )
+        velocities[0, size:] = others
+        return velocities
+
     @property
     def _continued_holds(self) -> list[Hold]:
         """Holds at the start that the task does not release at once."""
@@ -226,10 +277,12 @@ class TrajectoryProblem:
         limits = (self.chain.velocity, self.chain.acceleration)
         runs = split_at_stops(structure.stops, self.segments)
         least = self.rolling.compute_min_times(path)
-        dt = compute_step_times(path, self.options.dt, runs, limits, least)
+        dt = compute_step_times(
+            path, self.options.dt, runs, limits, least, end_velocities=self.end_velocities
+        )
         if structure.is_timed:
             dt = self.term_evaluator.lengthen_steps(z, dt, runs)
-        return Timing(dt, dt, runs, limits)
+        return Timing(dt, dt, runs, limits, self.end_velocities)
 
     def is_closed(self, phase: Phase) -> bool:
         """Return whether the chain is closed, by a grasp of an object fixed in the world."""
@@ -290,20 +343,25 @@ class TrajectoryProblem:
         waypoints = np.arange(1, self.segments + 1)
         return contacts.evaluate(z, waypoints, reach=reach, nearest=nearest)
 
-    def rates(self, z: Floats) -> tuple[Floats, Floats]:
-        """Return the steps δz, shape (N, n), and their changes δδz, shape (N + 1 + stops, n)."""
-        t = self.transcription
-        steps = t.first @ z + np.outer(t.start_first, self.start)
-        changes = t.second @ z + np.outer(t.start_second, self.start)
+    def rates(self, z: Floats, dt: Floats) -> tuple[Floats, Floats]:
+        """Return the steps δz, shape (N, n), and their changes δδz, shape (N + 1 + stops, n).
+
+        The first change is from the start velocity times the first of the step durations dt, shape
+        (N,) [s], the last one to the velocity at the end; see `Differences`.
+        """
+        d = self.transcription.differences
+        end_steps = compute_end_steps(self.end_velocities, dt)
+        steps = d.first @ z + np.outer(d.start_first, self.start)
+        changes = d.second @ z + np.outer(d.start_second, self.start) + d.end_second @ end_steps
         return steps, changes
 
-    def pace(self, z: Floats) -> tuple[Floats, Floats, Floats]:
+    def pace(self, z: Floats, dt: Floats) -> tuple[Floats, Floats, Floats]:
         """Return `rates` and the minimum step durations for the wheels, shape (N,) [s]."""
-        return *self.rates(z), self.rolling.compute_min_times(self.waypoints(z))
+        return *self.rates(z, dt), self.rolling.compute_min_times(self.waypoints(z))
 
     def objective(self, z: Floats, dt: Floats) -> float:
         """Return the cost of z_1..z_N, shape (N, n), with step durations dt, shape (N,) [s]."""
-        return self.motion_cost.value(*self.rates(z)) + self.term_evaluator.compute_cost(z, dt)
+        return self.motion_cost.value(*self.rates(z, dt)) + self.term_evaluator.compute_cost(z, dt)
 
     def pose_error(self, z: Floats) -> float:
         """Return the largest residual of closure (eq. 2), goals (eq. 3) and rolling [m], [rad]."""
@@ -388,11 +446,18 @@ class TrajectoryProblem:
             upper = np.concatenate([upper, rates])
         return lower, upper
 
-    def parameters_at(self, z: Floats) -> dict[str, Floats]:
-        """Return the parameters of the program that only depend on the iterate z_1..z_N."""
-        step_weights, change_weights = self.motion_cost.weights(*self.rates(z))
+    def parameters_at(self, z: Floats, dt: Floats) -> dict[str, Floats]:
+        """Return the parameters of the program that only depend on the iterate and its timing.
+
+        Args:
+            z: z_1..z_N, shape (N, n).
+            dt: Step durations, shape (N,) [s].
+        """
+        step_weights, change_weights = self.motion_cost.weights(*self.rates(z, dt))
         return {
             "start": self.start,
+            "end_steps": compute_end_steps(self.end_velocities, dt),
+            "dt": dt,
             "targets": np.array([flatten_placement(goal.target) for goal in self.pose_goals]),
             "frames": np.array([flatten_placement(goal.local) for goal in self.pose_goals]),
             "mounts": self.chain.tree.mounts,

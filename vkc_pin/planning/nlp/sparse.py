@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -50,12 +51,33 @@ def assemble(parts: list[ca.MX], at: list[Ints], rows: int, columns: int) -> ca.
     return ca.MX(pattern, values)
 
 
-def make_differences(segments: int, stops: Sequence[int]) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return matrices D, E and vectors d, e that map z_1..z_N and z_0 to steps and their changes.
+class Differences(NamedTuple):
+    """Matrices D, E, U and vectors d, e that map a motion to its steps and their changes.
 
-    D·z + d·z_0 are the steps δz_t = z_t − z_{t−1}, E·z + e·z_0 their changes δz_{t+1} − δz_t:
-    between steps, and from and to rest, δz = 0, where the motion starts, stops and ends. With the
-    matrix A that maps the steps to their changes, E = A·D and e = A·d.
+    D·z + d·z_0 are the steps δz_t = z_t − z_{t−1} of z_1..z_N. E·z + e·z_0 + U·u are their changes
+    δz_{t+1} − δz_t: between steps, from and to rest, δz = 0, where the motion stops, and from u_0 to
+    the first and from the last step to u_1, where it starts and ends: u_0 = v_0·dt_1 and u_1 =
+    v_N·dt_N are the steps of its start and end velocity.
+
+    Attributes:
+        first: D, shape (N, N).
+        second: E, shape (N + 1 + stops, N).
+        start_first: d, shape (N,).
+        start_second: e, shape (N + 1 + stops,).
+        end_second: U, shape (N + 1 + stops, 2).
+    """
+
+    first: Floats
+    second: Floats
+    start_first: Floats
+    start_second: Floats
+    end_second: Floats
+
+
+def make_differences(segments: int, stops: Sequence[int]) -> Differences:
+    """Return the matrices of the differences of a motion of N segments.
+
+    With the matrix A that maps the steps to their changes, E = A·D and e = A·d.
     """
     first = np.eye(segments) - np.eye(segments, k=-1)
     start = np.zeros(segments)
@@ -65,7 +87,10 @@ def make_differences(segments: int, stops: Sequence[int]) -> tuple[Floats, Float
         steps = np.eye(segments)[begin:end]
         changes_of_runs.append(np.diff(steps, axis=0, prepend=0.0, append=0.0))
     changes = np.vstack(changes_of_runs)
-    return first, changes @ first, start, changes @ start
+    ends = np.zeros((len(changes), 2))
+    ends[0, 0] = -1.0
+    ends[-1, 1] = 1.0
+    return Differences(first, changes @ first, start, changes @ start, ends)
 
 
 def make_curvature(parts: Sequence[Floats]) -> tuple[tuple[Ints, Ints], list[ca.DM]]:

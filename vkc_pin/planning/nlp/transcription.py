@@ -5,7 +5,7 @@ one relaxation variable e: x = (z_1, s_1, e_1, ..., z_N, s_N, e_N). With e = 1 t
 violate all its other constraints by as much as the iterate at which the program was set up; with e
 = 0 they hold exactly. Slacks and relaxation variables are penalised in the objective, which makes
 it an exact ℓ1 penalty function. Whatever differs between two tasks of the same structure is a
-parameter or a bound: start, targets, witness planes, penalty weights. The rows come from one small
+parameter or a bound: start, velocities at the ends, targets, witness planes, penalty weights. The rows come from one small
 SX function per kind of waypoint, mapped over the waypoints. Its exact Hessian is that of
 λᵀ·C·vec(M(z)) plus the pose rows, regardless of the number of witness planes.
 """
@@ -47,8 +47,8 @@ class Transcription:
         row_waypoints, rate_waypoints: Waypoint, counted from 0, whose relaxation variable widens
             the bounds of each of these rows and of the rate rows.
         relaxed_row_values: Function of x, z_0, step durations and gears → values of these rows.
-        rate_matrix, rate_start: Velocities and accelerations per step are rate_matrix·x +
-            rate_start·z_0.
+        rate_matrix, rate_start, rate_ends: Velocities and accelerations per step are rate_matrix·x
+            + rate_start·z_0 + rate_ends·u, with the steps u of the velocities at both ends.
     """
 
     def __init__(self, structure: Structure, cache: Cache) -> None:
@@ -82,6 +82,7 @@ class Transcription:
         self.waypoint_variables = ca.reshape(self.x, self.width, N)  # one column per waypoint
         self.z = self.waypoint_variables[:n, :]
         self.start = ca.MX.sym("z0", n)
+        self.end_steps = ca.MX.sym("u", n, 2)
         self.planes = ca.MX.sym("C", K * 12 * joints, N)
         self.offsets = ca.MX.sym("R", K, N)
         self.targets = ca.MX.sym("W", 12, poses)
@@ -100,6 +101,8 @@ class Transcription:
             **values: Parameters by name; those that are not given are zero.
 
                 - start: z_0, shape (n,).
+                - end_steps: Steps of the velocities at both ends, see `sparse.Differences`,
+                  shape (2, n).
                 - planes, offsets: Witness planes C, shape (N, K, 12·joints), and R, shape (N, K).
                 - targets, frames: Targets of the poses, and placements of their frames on the
                   joints, shape (poses, 12).
@@ -138,8 +141,8 @@ class Transcription:
     def _make_objective(self) -> None:
         """Build the objective: weighted squared steps and changes, and the penalties.
 
-        With the matrices D and E of `make_differences`, the steps S = D z + d z_0 and their changes
-        S' = E z + e z_0 (one column for each coordinate), weights w and v of their squares, and the
+        With the matrices of `Differences`, the steps S = D z + d z_0 and their changes S' = E z +
+        e z_0 + U u (one column for each coordinate), weights w and v of their squares, and the
         penalties ρ of slacks s and p of relaxation variables e,
 
             f = Σ w S² + Σ v S'² + ρ Σ s + Σ_t p_t e_t
@@ -147,25 +150,26 @@ class Transcription:
         """
         n = self.n
         N = self.segments
-        self.first, self.second, self.start_first, self.start_second = make_differences(
-            N, self.structure.stops
-        )
+        self.differences = make_differences(N, self.structure.stops)
+        first, second, start_first, start_second, end_second = self.differences
         self.step_weights = ca.MX.sym("w", N, n)
-        self.change_weights = ca.MX.sym("v", len(self.second), n)
+        self.change_weights = ca.MX.sym("v", len(second), n)
         slack_penalties = ca.repmat(self.penalty, self.slots, N)
         penalties = ca.vertcat(slack_penalties, self.relaxation_weights.T)
         self.f = ca.dot(penalties, self.waypoint_variables[n:, :])
         gradient = ca.MX(N, n)
-        for matrix, start, weights in (
-            (self.first, self.start_first, self.step_weights),
-            (self.second, self.start_second, self.change_weights),
+        steps = make_sparse(first) @ self.z.T + ca.DM(start_first) @ self.start.T
+        changes = make_sparse(second) @ self.z.T + ca.DM(start_second) @ self.start.T
+        changes += make_sparse(end_second) @ self.end_steps.T
+        for matrix, difference, weights in (
+            (first, steps, self.step_weights),
+            (second, changes, self.change_weights),
         ):
-            difference = make_sparse(matrix) @ self.z.T + ca.DM(start) @ self.start.T
             self.f += ca.dot(weights, difference**2)
             gradient += 2 * make_sparse(matrix.T) @ (weights * difference)
         self.gradient = ca.vec(ca.vertcat(gradient.T, penalties))
         # Coordinates do not mix: the same pairs of waypoints for each of the n coordinates.
-        (row, column), (by_steps, by_changes) = make_curvature([self.first, self.second])
+        (row, column), (by_steps, by_changes) = make_curvature([first, second])
         coordinates = np.arange(n)[:, None]
         rows = row * self.width + coordinates
         columns = column * self.width + coordinates
@@ -347,6 +351,7 @@ class Transcription:
             )
         self.parameter_symbols = {
             "start": self.start,
+            "end_steps": self.end_steps,
             "planes": self.planes,
             "offsets": self.offsets,
             "targets": self.targets,
@@ -379,12 +384,15 @@ class Transcription:
         identity = ca.DM.eye(n)
         # of a waypoint's variables the coordinates, without slacks and relaxation variable
         select = ca.horzcat(identity, ca.DM(n, self.slots + 1))
-        steps = ca.kron(make_sparse(self.first), select)
-        changes = ca.kron(make_sparse(self.second), select)
+        differences = self.differences
+        steps = ca.kron(make_sparse(differences.first), select)
+        changes = ca.kron(make_sparse(differences.second), select)
         self.rate_matrix = ca.vertcat(steps, changes)
-        steps_of_start = ca.kron(make_sparse(self.start_first[:, None]), identity)
-        changes_of_start = ca.kron(make_sparse(self.start_second[:, None]), identity)
+        steps_of_start = ca.kron(make_sparse(differences.start_first[:, None]), identity)
+        changes_of_start = ca.kron(make_sparse(differences.start_second[:, None]), identity)
         self.rate_start = ca.vertcat(steps_of_start, changes_of_start)
+        changes_of_ends = ca.kron(make_sparse(differences.end_second), identity)
+        self.rate_ends = ca.vertcat(ca.DM(steps.size1(), 2 * n), changes_of_ends)
         change_steps = find_change_steps(self.structure.stops, self.segments)
         self.rate_waypoints = np.repeat([*range(self.segments), *change_steps], n)
 
@@ -407,6 +415,7 @@ class Transcription:
         hessian = weight * self.objective_curvature + self.hessian
         if rates:
             rate_rows = self.rate_matrix @ self.x + self.rate_start @ self.start
+            rate_rows += self.rate_ends @ ca.vec(self.end_steps)
             g = ca.vertcat(g, rate_rows)
             jacobian = ca.vertcat(jacobian, self.rate_matrix)
             multipliers = ca.MX.sym("lam", g.numel())

@@ -57,10 +57,17 @@ class CubicPath:
         return derivative
 
 
-def compute_natural_slopes(x: Floats, y: Floats) -> Floats:
+EndSlopes = tuple[Floats | None, Floats | None]
+"""Slopes at the first and the last knot of a spline, shape (n,); None: free."""
+
+FREE_ENDS: EndSlopes = (None, None)
+"""Slopes at both ends are free."""
+
+
+def compute_natural_slopes(x: Floats, y: Floats, end_slopes: EndSlopes = FREE_ENDS) -> Floats:
     """Return the slopes at knots of the cubic spline that is twice differentiable.
 
-    Its second derivative is zero at both ends. With h_k = x_{k+1} - x_k, continuity of the second
+    Its second derivative is zero at ends whose slopes are free. With h_k = x_{k+1} - x_k, continuity of the second
     derivative at knot k is
 
         h_k d_{k-1} + 2 (h_{k-1} + h_k) d_k + h_{k-1} d_{k+1} = 3 (h_k c_{k-1} + h_{k-1} c_k)
@@ -73,8 +80,9 @@ def compute_natural_slopes(x: Floats, y: Floats) -> Floats:
     elimination without pivoting.
 
     Args:
-        x: Increasing positions of the knots, shape (K,), K ≥ 3.
+        x: Increasing positions of the knots, shape (K,), K ≥ 3, or 2 with a given slope.
         y: Values at the knots, shape (K, n).
+        end_slopes: Given slopes at the ends.
     """
     widths = np.diff(x)
     chords = np.diff(y, axis=0) / widths[:, None]
@@ -86,6 +94,15 @@ def compute_natural_slopes(x: Floats, y: Floats) -> Floats:
     right_side[0] = 3.0 * (y[1] - y[0])
     right_side[1:-1] = 3.0 * (widths[1:, None] * chords[:-1] + widths[:-1, None] * chords[1:])
     right_side[-1] = 3.0 * (y[-1] - y[-2])
+    begin, end = end_slopes
+    if begin is not None:
+        diagonal[0] = 1.0
+        upper[0] = 0.0
+        right_side[0] = begin
+    if end is not None:
+        diagonal[-1] = 1.0
+        lower[-1] = 0.0
+        right_side[-1] = end
     # Eliminate the lower diagonal.
     for k in range(len(x) - 1):
         factor = lower[k] / diagonal[k]

@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 
 from vkc_pin.planning.base_paths.arcs import interpolate_arcs
+from vkc_pin.planning.retiming.braking import make_accelerating_curve, make_braking_curve
 from vkc_pin.planning.retiming.cubic_path import CubicPath
 from vkc_pin.planning.retiming.limits import Limits, limit_jerk
 from vkc_pin.planning.retiming.spline_path import fit_path
@@ -37,6 +38,9 @@ _JUMP_RATIO = 1e-4
 # search for speeds within torque limits: iterations, and relative change at convergence
 _TORQUE_ITERATIONS = 4
 _TORQUE_TOLERANCE = 0.02
+# Attempts to keep the limits with velocities at the ends, and relative margin of each
+_TIGHTENINGS = 8
+_TIGHTENING_MARGIN = 1.002
 # [m/s], lateral velocity of a wheeled base that needs no more knots, a fifth of what counts as slip
 _MAX_SLIP = 2e-4
 _MAX_REFINEMENT = 8  # of the knots
@@ -54,17 +58,18 @@ def retime_trajectory(
     *,
     jerk_time: float = 0.0,
     close: Close | None = None,
+    end_velocities: Floats | None = None,
 ) -> Trajectory:
     """Return a smooth trajectory through the same waypoints, as fast as its limits allow.
 
-    It starts and ends at rest, rests during steps without motion, and stops where a joint of an
+    It starts and ends with given velocities, rests during steps without motion, and stops where a joint of an
     object starts or ceases to move, since the hand changes direction there; with jerk limits also
     before and after a step that is far shorter than its neighbour. A step without motion
     at the begin of a phase, as when a hand opens, keeps its duration. Between stops it follows
     `fit_path` at the speeds of `compute_speeds`, or else straight lines with stops at all
     waypoints; a wheeled base follows `fit_rolling_paths`. The resulting cubics are slowed down
     until they keep the velocity and acceleration limits exactly, and the torque limits if possible.
-    `limit_jerk` limits their jerk.
+    `limit_jerk` limits their jerk. For velocities at the ends see `_follow_between_velocities`.
 
     Args:
         scene: Robot and objects.
@@ -73,7 +78,12 @@ def retime_trajectory(
             passes through the ends of all parts. Defaults to one.
         jerk_time: See `Options.jerk_time`.
         close: Closes chains where lines are parted, which straight lines of the coordinates open.
+        end_velocities: Velocities at the start and the end, shape (2, n). Defaults to the scene's
+            start velocity, with objects at rest, and to rest at the end.
     """
+    if end_velocities is None:
+        end_velocities = np.zeros((2, len(trajectory.names)))
+        end_velocities[0, : trajectory.robot_size] = scene.start_velocity
     limits = Limits.from_scene(scene, trajectory.names, jerk_time)
     if parts is None:
         parts = np.ones(len(trajectory.times) - 1, int)
@@ -98,14 +108,22 @@ def retime_trajectory(
     point_knots = [0]  # indices of all points among the knots of the curve
     for first, last in _split_into_runs(is_stop):
         points = positions[first : last + 1]
-        if is_still[first]:
-            least = [wait_durations.get(step, _WAIT_DURATION) for step in range(first, last)]
-            straight = _make_straight_curve(points, limits, np.array(least))
-            curves = [(straight, np.arange(1, len(points)))]
+        least = [wait_durations.get(step, _WAIT_DURATION) for step in range(first, last)]
+        torque_bounds = None
+        if torques.torque_limits.is_known:
+            torque_bounds = TorqueBounds(torques, phases[first:last])
+        velocities = np.zeros_like(end_velocities)
+        if first == 0:
+            velocities[0] = end_velocities[0]
+        if last == len(lengths):
+            velocities[1] = end_velocities[1]
+        if velocities.any():
+            curves = _follow_between_velocities(
+                points, velocities, limits, scale, rolling, torque_bounds, np.array(least)
+            )
+        elif is_still[first]:
+            curves = [_stop_at_waypoints(points, limits, np.array(least))]
         else:
-            torque_bounds = None
-            if torques.torque_limits.is_known:
-                torque_bounds = TorqueBounds(torques, phases[first:last])
             curves = _follow_waypoints(points, limits, scale, rolling, torque_bounds)
         for piece, knots in curves:
             point_knots += (point_knots[-1] + knots).tolist()
@@ -163,6 +181,95 @@ def _split_into_runs(is_stop: Bools) -> Iterator[tuple[int, int]]:
     yield from itertools.pairwise([0, *inner_stops, len(is_stop) + 1])
 
 
+def _follow_between_velocities(
+    points: Floats,
+    velocities: Floats,
+    limits: Limits,
+    scale: Floats,
+    rolling: RollingLimits,
+    torque_bounds: TorqueBounds | None,
+    least: Floats,
+) -> list[tuple[Curve, Ints]]:
+    """Return curves through waypoints, shape (m, n), with given velocities at both ends, (2, n).
+
+    The path leaves the first waypoint along its velocity, at that speed, and arrives likewise. If
+    no timing of it keeps the limits, and always with jerk limits and on wheels, the motion brakes
+    to rest along its first velocity and continues from there; at its end it accelerates from rest.
+    `least` are the durations [s] of steps without motion, shape (m − 1,).
+    """
+    if rolling.is_omnidirectional and limits.has_unlimited_jerk:
+        result = _retime_between_velocities(points, velocities, limits, scale, torque_bounds)
+        if result is not None:
+            return [result]
+    points = points.copy()
+    brake = None
+    if velocities[0].any():
+        brake = make_braking_curve(points[0], velocities[0], limits, rolling)
+        points[0] = brake.positions[-1]
+    acceleration = None
+    if velocities[1].any():
+        acceleration = make_accelerating_curve(points[-1], velocities[1], limits, rolling)
+        points[-1] = acceleration.positions[0]
+    lengths = np.linalg.norm(np.diff(points, axis=0) * scale, axis=1)
+    if (lengths <= _MIN_STEP_DURATION).any():
+        curves = [_stop_at_waypoints(points, limits, least)]
+    else:
+        curves = _follow_waypoints(points, limits, scale, rolling, torque_bounds)
+    if brake is not None:
+        curve, knots = curves[0]
+        curves[0] = (concatenate_curves([brake, curve]), knots + len(brake.times) - 1)
+    if acceleration is not None:
+        curve, knots = curves[-1]
+        curve = concatenate_curves([curve, acceleration])
+        curves[-1] = (curve, np.append(knots[:-1], len(curve.times) - 1))
+    return curves
+
+
+def _retime_between_velocities(
+    points: Floats,
+    velocities: Floats,
+    limits: Limits,
+    scale: Floats,
+    torque_bounds: TorqueBounds | None,
+) -> tuple[Curve, Ints] | None:
+    """Return a curve through waypoints, (m, n), that has given velocities at both ends, or None.
+
+    It cannot be slowed down, since its ends have their velocities. If its cubics exceed limits
+    between the positions of TOPP-RA, that gets tighter ones.
+    """
+    lengths = np.linalg.norm(np.diff(points, axis=0) * scale, axis=1)
+    if (lengths <= _MIN_STEP_DURATION).any():
+        return None
+    # The path is parametrised by its length: the path velocity is that of the scaled coordinates.
+    first_speed, last_speed = np.linalg.norm(velocities * scale, axis=1).tolist()
+    first_slope = velocities[0] / first_speed if first_speed > 0.0 else None
+    last_slope = velocities[1] / last_speed if last_speed > 0.0 else None
+    path = fit_path(points, scale, (limits.lower, limits.upper), (first_slope, last_slope))
+    places = _choose_places(path, len(points) - 1)
+    slower = 1.0
+    for _ in range(_TIGHTENINGS):
+        speeds = compute_speeds(
+            path,
+            places,
+            limits.velocity / slower,
+            limits.acceleration / slower**2,
+            end_speeds=(first_speed, last_speed),
+        )
+        if speeds is None:
+            return None
+        pace = _make_pace(places, speeds)
+        rates = path(places, 1) * pace.rates
+        rates[[0, -1]] = velocities  # bit-exact
+        curve = Curve(pace.times, path(places), rates)
+        excess = limits.compute_slowdown(curve)
+        if excess <= 1.0 + 2.0 * _ROUNDING:
+            if torque_bounds is not None and np.abs(torque_bounds.evaluate(curve)).max() > 1.0:
+                return None
+            return _pass_through(points, curve)
+        slower *= _TIGHTENING_MARGIN * excess
+    return None
+
+
 def _follow_waypoints(
     points: Floats,
     limits: Limits,
@@ -181,10 +288,10 @@ def _follow_waypoints(
     if result is not None:
         return [result]
     if limits.has_unlimited_jerk:
-        straight = _make_straight_curve(points, limits, np.zeros(len(points) - 1))
+        straight, knots = _stop_at_waypoints(points, limits, np.zeros(len(points) - 1))
         if torque_bounds is not None:
             straight = torque_bounds.slow_down(straight)
-        return [(straight, np.arange(1, len(points)))]
+        return [(straight, knots)]
     steps = []
     for k in range(len(points) - 1):
         ends = points[k : k + 2]
@@ -234,10 +341,7 @@ def _retime_path(
 
     Torques are checked only for the fastest curve within the other limits, since few exceed them.
     """
-    cubics_per_step = (len(path.x) - 1) // (len(points) - 1)
-    pieces_per_cubic = max(_MIN_PIECES // cubics_per_step, 1)
-    fractions = np.arange(pieces_per_cubic) / pieces_per_cubic
-    places = sample_intervals(path.x, fractions, last=True)
+    places = _choose_places(path, len(points) - 1)
     speeds = compute_speeds(path, places, limits.velocity, limits.acceleration)
     if speeds is None:
         return None
@@ -262,17 +366,29 @@ def _retime_path(
     return torque_bounds.slow_down(curve), waypoints
 
 
+def _choose_places(path: CubicPath, steps: int) -> Floats:
+    """Return the positions on a path of equal cubics in every step at which speeds are computed."""
+    cubics_per_step = (len(path.x) - 1) // steps
+    pieces_per_cubic = max(_MIN_PIECES // cubics_per_step, 1)
+    fractions = np.arange(pieces_per_cubic) / pieces_per_cubic
+    return sample_intervals(path.x, fractions, last=True)
+
+
 def _follow_at_speeds(
     path: CubicPath, places: Floats, points: Floats, speeds: Floats, limits: Limits
 ) -> tuple[Curve, Ints]:
-    """Return the curve along a path at given speeds, and the waypoints' knots.
+    """Return the curve along a path at given speeds, and the waypoints' knots."""
+    return _follow_at_pace(path, _make_pace(places, speeds), points, limits)
 
-    The speed is linear in time between two places: each distance is the duration times the mean.
+
+def _make_pace(places: Floats, speeds: Floats) -> Curve:
+    """Return the progress along a path whose speed is linear in time between two places.
+
+    Each distance is the duration times the mean speed.
     """
     durations = 2.0 * np.diff(places) / (speeds[1:] + speeds[:-1])
     times = np.concatenate([[0.0], np.cumsum(durations)])
-    pace = Curve(times, places[:, None], speeds[:, None])
-    return _follow_at_pace(path, pace, points, limits)
+    return Curve(times, places[:, None], speeds[:, None])
 
 
 def _follow_at_pace(
@@ -285,6 +401,11 @@ def _follow_at_pace(
         curve = limits.slow_down(Curve(pace.times, path(places), rates))
     else:
         curve = limit_jerk(path, pace, len(points) - 1, limits)
+    return _pass_through(points, curve)
+
+
+def _pass_through(points: Floats, curve: Curve) -> tuple[Curve, Ints]:
+    """Return a curve with waypoints, (m, n), as knots, bit by bit, and the knots of all but one."""
     size = points.shape[1]  # without the travel of wheels
     positions = np.array(curve.positions[:, :size])
     cubics_per_step = (len(positions) - 1) // (len(points) - 1)
@@ -312,8 +433,8 @@ def _follow_step(
     return curve, waypoints
 
 
-def _make_straight_curve(points: Floats, limits: Limits, least: Floats) -> Curve:
-    """Return straight lines through waypoints, shape (m, n), with a stop at each waypoint.
+def _stop_at_waypoints(points: Floats, limits: Limits, least: Floats) -> tuple[Curve, Ints]:
+    """Return straight lines through waypoints, shape (m, n), with a stop at each, and their knots.
 
     3s² − 2s³ has a peak velocity of 1.5, a peak acceleration of 6, which is attained in a jump, and
     a jerk of 12. With jerk limits the acceleration is therefore almost zero. A distance x takes at
@@ -329,4 +450,4 @@ def _make_straight_curve(points: Floats, limits: Limits, least: Floats) -> Curve
     durations = np.maximum.reduce([least, for_velocity, for_acceleration, for_jerk])
     durations = np.maximum(durations, MIN_INTERVAL) * (1.0 + _ROUNDING)
     times = np.concatenate([[0.0], np.cumsum(durations)])
-    return Curve(times, points, np.zeros_like(points))
+    return Curve(times, points, np.zeros_like(points)), np.arange(1, len(points))

@@ -4,12 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from vkc_pin.planning.retiming.cubic_path import CubicPath, compute_natural_slopes
+from vkc_pin.planning.retiming.cubic_path import (
+    FREE_ENDS,
+    CubicPath,
+    EndSlopes,
+    compute_natural_slopes,
+)
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.trajectory.curve import Curve
 
 
-def fit_path(points: Floats, scale: Floats, limits: tuple[Floats, Floats]) -> CubicPath:
+def fit_path(
+    points: Floats,
+    scale: Floats,
+    limits: tuple[Floats, Floats],
+    end_slopes: EndSlopes = FREE_ENDS,
+) -> CubicPath:
     """Return a cubic spline through waypoints, parametrised by the length of the polyline.
 
     It is twice differentiable and linear in the waypoints, so that linear constraints that hold at
@@ -22,18 +32,25 @@ def fit_path(points: Floats, scale: Floats, limits: tuple[Floats, Floats]) -> Cu
         points: Waypoints, shape (m, n), m ≥ 2, consecutive ones distinct.
         scale: Weight of each coordinate in the length, shape (n,).
         limits: Lower and upper limits, shape (n,) each.
+        end_slopes: Given derivatives by the length at the ends, which are kept in any case.
     """
     steps = np.diff(points, axis=0)
     lengths = np.linalg.norm(steps * scale, axis=1)
     arc_lengths = np.concatenate([[0.0], np.cumsum(lengths)])
     chords = steps / lengths[:, None]
-    if len(points) > 2:
-        slopes = compute_natural_slopes(arc_lengths, points)
+    begin, end = end_slopes
+    if len(points) > 2 or begin is not None or end is not None:
+        slopes = compute_natural_slopes(arc_lengths, points, end_slopes)
     else:
         slopes = np.repeat(chords, 2, axis=0)
     if not _exceeds_limits(points, slopes, arc_lengths, limits):
         return CubicPath(arc_lengths, points, slopes)
-    return CubicPath(arc_lengths, points, _limit_slopes(slopes, chords))
+    limited_slopes = _limit_slopes(slopes, chords)
+    if begin is not None:
+        limited_slopes[0] = begin
+    if end is not None:
+        limited_slopes[-1] = end
+    return CubicPath(arc_lengths, points, limited_slopes)
 
 
 def _limit_slopes(slopes: Floats, chords: Floats) -> Floats:

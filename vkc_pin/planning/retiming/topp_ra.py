@@ -1,4 +1,4 @@
-"""Computes the fastest speed along a path from rest to rest (time-optimal path parametrisation)."""
+"""Computes the fastest speed along a path (time-optimal path parametrisation)."""
 
 from __future__ import annotations
 
@@ -30,8 +30,9 @@ def compute_speeds(
     velocity: Floats,
     acceleration: Floats,
     linear: Callable[[Floats], tuple[Floats, Floats, Floats]] | None = None,
+    end_speeds: tuple[float, float] = (0.0, 0.0),
 ) -> Floats | None:
-    """Return the fastest speeds along a path at given positions, from rest to rest.
+    """Return the fastest speeds along a path at given positions, by default from rest to rest.
 
     Between two positions the speed is linear in time. Along a path q(s), with the path velocity w
     and acceleration u,
@@ -49,6 +50,7 @@ def compute_speeds(
         acceleration: Acceleration limits, shape (n,) [m/s²], [rad/s²]; inf: none.
         linear: Further constraints: returns a, b, c at positions, shape (K, m) each, with |a u + b
             w² + c| ≤ 1 for the path velocity w and acceleration u. Defaults to none.
+        end_speeds: Path velocities at the start and the end [1/s].
 
     Returns:
         Path velocities, shape (K,) [1/s], or None if they cannot be computed.
@@ -64,7 +66,7 @@ def compute_speeds(
     for offset in _KNOT_OFFSETS:
         grid = _replace_knots(path.x, positions, offset)
         solver = TOPPRA([constraint], toppra_path, gridpoints=grid, solver_wrapper="seidel")
-        _, speeds, _ = solver.compute_parameterization(0.0, 0.0)
+        _, speeds, _ = solver.compute_parameterization(*end_speeds)
         if speeds is None:
             continue
         is_moving = np.isfinite(speeds).all() and (speeds[1:-1] > 0.0).all()

@@ -273,8 +273,7 @@ class _Loop:
     def _accept(self, trial: _Point) -> None:
         """Make `trial` the iterate; adapt time steps and rate limits to it."""
         was_infeasible = self.point.infeasibility.max_violation > TOLERANCE
-        pace = self.problem.pace(trial.z)
-        is_too_fast = self.timing.compute_violation(*pace) > TOLERANCE
+        is_too_fast = self._is_too_fast(trial.z)
         self._set_point(trial)
         self.solution.z = trial.z
         point = self.point  # the trial, or the same waypoints with other directions of stretches
@@ -284,8 +283,9 @@ class _Loop:
             self.timing = self.problem.timing_for(point.z)
         # Before it is nearly clear, rate limits only cost time.
         if point.contacts.compute_violation() < NEARLY_FEASIBLE and is_too_fast:
+            pace = self.problem.pace(point.z, self.timing.dt)
             self.timing = self.timing.stretch(*pace)
-            if not self.rates and self.timing.compute_violation(*pace) > TOLERANCE:
+            if not self.rates and self._is_too_fast(point.z):
                 self.rates = True
                 self.subproblem.reset_multipliers()
         if self.timing is not last_timing:
@@ -296,12 +296,16 @@ class _Loop:
 
     def _is_feasible(self) -> bool:
         """Return whether the iterate satisfies all constraints, also within segments."""
-        pace = self.problem.pace(self.point.z)
         return (
             self.point.is_clear
             and self.point.pose_error < TOLERANCE
-            and self.timing.compute_violation(*pace) <= TOLERANCE
+            and not self._is_too_fast(self.point.z)
         )
+
+    def _is_too_fast(self, z: Floats) -> bool:
+        """Return whether waypoints z_1..z_N, shape (N, n), exceed rate limits at this timing."""
+        pace = self.problem.pace(z, self.timing.dt)
+        return self.timing.compute_violation(*pace) > TOLERANCE
 
 
 def solve(

@@ -137,11 +137,10 @@ class Subproblem:
             planes=planes,
             offsets=offsets,
             penalty=merit.weights["clearance"],
-            dt=timing.dt,
             pose_offsets=found.pose_offsets,
             excess=found.excess,
             relaxation_weights=penalties,
-            **problem.parameters_at(z),
+            **problem.parameters_at(z, timing.dt),
         )
         shortfall = compute_shortfalls(at, t.segments, t.slots)
         # Planes whose margin holds get no slack: it must hold after the step, too.

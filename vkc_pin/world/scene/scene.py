@@ -47,6 +47,7 @@ from vkc_pin.world.scene.hold import (
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 from vkc_pin.world.scene.poses import as_placement
+from vkc_pin.world.scene.start_velocity import make_start_velocity
 
 if TYPE_CHECKING:
     from vkc_pin.world.models.robot import Base, Robot
@@ -70,6 +71,8 @@ class Scene:
         robot: Robot.
         start: Initial configuration: base x, y [m], yaw [rad], then the arm joints [rad], shape
             (n,).
+        start_velocity: Velocity of these coordinates at the start, shape (n,), [m/s] and [rad/s];
+            zero by default.
         objects: Name → articulated object. A free object that is held is placed in the robot's
             hand.
         obstacles: Fixed obstacles as convex shapes: parent joint 0, placement in the world frame,
@@ -97,6 +100,7 @@ class Scene:
     folder: Path
     robot: Robot
     start: Floats
+    start_velocity: Floats
     objects: Mapping[str, PlacedObject]
     obstacles: tuple[pin.GeometryObject, ...]
     obstacle_labels: tuple[str, ...]
@@ -162,7 +166,7 @@ class Scene:
     ) -> Scene:
         """Return the scene with another robot, which starts at the same place and holds nothing.
 
-        Its arm is at home, and its gripper as in the rest configuration. For other arguments of
+        It starts at rest. Its arm is at home, and its gripper as in the rest configuration. For other arguments of
         `load_robot`, give the path of a robot.yaml.
 
         Args:
@@ -194,7 +198,11 @@ class Scene:
         return Scene.from_document(document, self.folder)
 
     def with_start(
-        self, base: ArrayLike | None = None, arm: ArrayLike | Mapping[str, float] | None = None
+        self,
+        base: ArrayLike | None = None,
+        arm: ArrayLike | Mapping[str, float] | None = None,
+        *,
+        velocity: ArrayLike | Mapping[str, float] | None = None,
     ) -> Scene:
         """Return the scene with another start.
 
@@ -202,11 +210,13 @@ class Scene:
             base: x, y [m] and yaw [rad] in the world frame, shape (3,); None keeps it.
             arm: Arm joints [rad], shape (n - 3,), or joint → value for some of them; None keeps
                 them.
+            velocity: Velocity of all coordinates, shape (n,), [m/s] and [rad/s], or coordinate →
+                velocity, where those that are not named are at rest; None keeps it.
 
         Raises:
-            UnknownNameError: The robot has no such arm joint.
+            UnknownNameError: The robot has no such arm joint or coordinate.
             InputError: Wrong size, a value that is not finite, outside a joint's limits or outside
-                the arena.
+                the arena; a velocity beyond its limit, or with which a base on wheels would slip.
         """
         names = self.robot.coordinates.names
         start = self.start.copy()
@@ -220,7 +230,9 @@ class Scene:
         problem = "outside the arena"
         start[0] = clamp_to_limits(start[0], x_min, x_max, f"base.{names[0]}", problem)
         start[1] = clamp_to_limits(start[1], y_min, y_max, f"base.{names[1]}", problem)
-        return self._with(start=start)
+        wanted = self.start_velocity if velocity is None else velocity
+        start_velocity = make_start_velocity(self.robot, start, wanted)
+        return self._with(start=start, start_velocity=start_velocity)
 
     def _check_start_values(self, values: ArrayLike, field: str, part: slice) -> list[float]:
         """Return the values of a `part` of the coordinates at the start."""

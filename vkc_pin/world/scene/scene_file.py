@@ -36,6 +36,7 @@ from vkc_pin.world.scene.hold import (
 )
 from vkc_pin.world.scene.obstacles import FLOOR, make_floor_shape, make_obstacle_shapes
 from vkc_pin.world.scene.placed_object import PlacedObject
+from vkc_pin.world.scene.start_velocity import make_start_velocity
 
 
 def make_scene_fields(document: Document, folder: Path) -> dict[str, Any]:
@@ -61,12 +62,14 @@ def make_scene_fields(document: Document, folder: Path) -> dict[str, Any]:
         labels.append(FLOOR)
     _check_within_arena(document, description, arena)
     start = _make_start(document, description.start, robot)
+    start_velocity = _make_start_velocity(document, description.start, robot, start)
     return {
         "name": description.name or (document.file.stem if document.file else "scene"),
         "file": document.file,
         "folder": folder,
         "robot": robot,
         "start": start,
+        "start_velocity": start_velocity,
         "objects": freeze(objects),
         "obstacles": tuple(obstacles),
         "obstacle_labels": tuple(labels),
@@ -109,6 +112,10 @@ def make_document(fields: Mapping[str, Any]) -> dict[str, Any]:
     is_at_home = np.array_equal(start[3:], fields["robot"].home)
     if described.start.arm is not None or not is_at_home:
         start_entry["arm"] = start[3:].tolist()
+    if fields["start_velocity"].any():
+        names = fields["robot"].coordinates.names
+        velocities = zip(names, fields["start_velocity"].tolist(), strict=True)
+        start_entry["velocity"] = {name: value for name, value in velocities if value != 0.0}
     start_entry["held"] = held
     document = {
         "name": fields["name"],
@@ -247,6 +254,19 @@ def _make_start(document: Document, item: schema.StartSchema, robot: Robot) -> F
         with document.annotate_errors(path):
             start[index] = check_start_value(start[index], lower[index], upper[index], name)
     return start
+
+
+def _make_start_velocity(
+    document: Document, item: schema.StartSchema, robot: Robot, start: Floats
+) -> Floats:
+    names = robot.coordinates.names
+    for name in item.velocity:
+        if name not in names:
+            kind = f"coordinate of robot '{robot.name}'"
+            path = ("start", "velocity", name)
+            raise document.make_unknown_name_error(path, kind, name, names)
+    with document.annotate_errors(("start", "velocity")):
+        return make_start_velocity(robot, start, item.velocity)
 
 
 def _fill_arm(document: Document, given: Mapping[str, float], robot: Robot) -> list[float]:

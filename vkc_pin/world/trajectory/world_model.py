@@ -238,7 +238,7 @@ def compute_frame_placement(
 
 
 def make_scene_at(scene: Scene, world: World, row: Floats, values: Mapping[str, float]) -> Scene:
-    """Return a scene in which robot and objects are elsewhere, and nothing is held.
+    """Return a scene in which robot and objects are elsewhere, at rest, and nothing is held.
 
     Args:
         scene: Scene.
@@ -251,7 +251,8 @@ def make_scene_at(scene: Scene, world: World, row: Floats, values: Mapping[str, 
     lower, upper = scene.robot.start_limits
     robot = np.clip(robot, np.minimum(lower, scene.start), np.maximum(upper, scene.start))
     robot[:2] = np.clip(robot[:2], scene.arena[::2], scene.arena[1::2])
-    after = scene.with_held({}).with_start(base=robot[:3], arm=robot[3:])
+    at_rest = np.zeros(len(robot))
+    after = scene.with_held({}).with_start(base=robot[:3], arm=robot[3:], velocity=at_rest)
     for name, placed in scene.objects.items():
         item = placed.object
         if item.free:

@@ -40,6 +40,7 @@ class PairTable:
         self_distance: Required clearance between links of the robot [m]. Default: `dist_safe`.
         windows: Pairs that may be closer, with their intervals.
         samples: Samples of the motion, if they exist already.
+        obstacles_only: Whether pairs of two bodies are left out.
     """
 
     def __init__(
@@ -52,6 +53,7 @@ class PairTable:
         *,
         windows: Sequence[Window] = (),
         samples: Samples | None = None,
+        obstacles_only: bool = False,
     ) -> None:
         self.scene = scene
         self.world = solids.world
@@ -70,7 +72,7 @@ class PairTable:
         # The phase of each waypoint; of two, the earlier one.
         lasts = [phase.last for phase in trajectory.phases]
         self._phase = np.searchsorted(lasts, np.arange(len(trajectory.times)))
-        own = self._pair_bodies()
+        own = np.zeros((0, 2), int) if obstacles_only else self._pair_bodies()
         self.pairs = np.concatenate([own, self._pair_with_obstacles()])
         if not len(self.pairs):
             raise InputError(
@@ -268,25 +270,34 @@ class Hit(NamedTuple):
     shapes: tuple[int, int] = (-1, -1)
 
 
-def sweep(table: PairTable, z: Floats, waypoints: Ints) -> Iterator[Hit]:
-    """Yield close pairs along a motion: at first those at waypoints, at least one at each.
+def sweep(
+    table: PairTable, z: Floats, waypoints: Ints, *, first: int = 0, close_only: bool = False
+) -> Iterator[Hit]:
+    """Yield close pairs along a motion: first those at waypoints, then those between them.
 
-    `z` are configurations of the world, shape (S, n), evenly spaced between `waypoints`, which are
-    rows of it, shape (T,).
+    Args:
+        table: Pairs that could collide.
+        z: Configurations of the world, shape (S, n), evenly spaced between waypoints.
+        waypoints: Rows of `z` that are the waypoints, shape (T,).
+        first: First waypoint of the part of the motion that is searched.
+        close_only: Whether only pairs that violate their clearance, or might, are yielded.
+            Otherwise the closest pair of each waypoint is yielded, too, and the closest of all.
     """
-    return _Sweep(table).find_hits(z, waypoints)
+    return _Sweep(table, waypoints, first, close_only=close_only).find_hits(z)
 
 
 class _Sweep:
     """Searches a motion for close pairs, at waypoints and then between them."""
 
-    def __init__(self, table: PairTable) -> None:
+    def __init__(self, table: PairTable, waypoints: Ints, first: int, *, close_only: bool) -> None:
         self._table = table
         self._solids = table.solids
-        self._waypoints = np.zeros(0, int)
-
-    def find_hits(self, z: Floats, waypoints: Ints) -> Iterator[Hit]:
         self._waypoints = waypoints
+        self._first = first
+        self._close_only = close_only
+
+    def find_hits(self, z: Floats) -> Iterator[Hit]:
+        waypoints = self._waypoints
         placed = self._place(z[waypoints])
         at, pairs, distances = self._find_nearest(placed)
         margins = self._table.get_margins(pairs, at)
@@ -299,7 +310,9 @@ class _Sweep:
             waypoints[at[chosen]], pairs[chosen], distances[chosen], at_waypoint=True
         )
         # Pairs that stay further apart do not affect the report.
-        smallest = max(RESOLUTION, float(distances[closest].min(initial=np.inf)))
+        smallest = RESOLUTION
+        if not self._close_only:
+            smallest = max(RESOLUTION, float(distances[closest].min(initial=np.inf)))
         moved = bound_displacements(self._solids, z)
         segments, pairs = self._find_active_pairs(
             placed, np.diff(moved[waypoints], axis=0), smallest
@@ -393,10 +406,13 @@ class _Sweep:
                     stacks[k] += parts[k].split(half, distance)
 
     def _find_nearest(self, placed: PlacedShapes) -> tuple[Ints, Ints, Floats]:
-        """Return states, pairs and distances [m] of the closest pairs and all below margins."""
+        """Return states, pairs and distances [m] of the closest pairs and all below margins.
+
+        The closest pairs are left out if only close ones are searched.
+        """
         found: list[tuple[Ints, Ints, Floats]] = []
         reach = max(self._table.margins.max(), RESOLUTION)
-        todo = np.arange(len(placed))  # states whose closest pair is not known
+        todo = np.arange(self._first, len(placed))  # states whose closest pair is not known
         while len(todo):
             at_rest = np.zeros((len(todo), len(self._table.groups)))
             at, pairs = self._table.find_close_pairs(placed, todo, todo, at_rest, reach)
@@ -405,7 +421,8 @@ class _Sweep:
             smallest = np.full(len(placed), np.inf)
             is_apart = self._table.get_margins(pairs, states) > -np.inf
             np.minimum.at(smallest, states[is_apart], distances[is_apart])
-            is_done = ~(smallest > reach)  # all other pairs are further apart
+            # All other pairs are further apart.
+            is_done = ~(smallest > reach) | self._close_only
             is_kept = is_done[states]
             found.append((states[is_kept], pairs[is_kept], distances[is_kept]))
             todo = todo[~is_done[todo]]
@@ -424,8 +441,9 @@ class _Sweep:
         By the bound of `_search_intervals`, the distance at one of both ends is then less than
         `smallest` plus half the relative motion.
         """
-        begin = np.arange(len(moved))
-        return self._table.find_close_pairs(placed, begin, begin + 1, moved, smallest)
+        begin = np.arange(self._first, len(moved))
+        at, pairs = self._table.find_close_pairs(placed, begin, begin + 1, moved[begin], smallest)
+        return begin[at], pairs
 
     def _find_interval(self, rows: Ints) -> Ints:
         """Return the last waypoint at or before each sample, shape (n,)."""

@@ -67,9 +67,23 @@ def find_contact_windows(
     steps: Sequence[Step],
     options: Options,
     tolerances: Tolerances,
+    *,
+    obstacles_only: bool = False,
 ) -> list[Window]:
-    """Find all pairs of a motion that may be close, and when, by the scene's contact rules."""
-    return list(_WindowFinder(samples, solids, options, tolerances).find(steps))
+    """Find all pairs of a motion that may be close, and when, by the scene's contact rules.
+
+    Args:
+        samples: Sampled motion.
+        solids: Shapes of robot, objects and obstacles.
+        steps: Steps of the motion.
+        options: Clearances to keep.
+        tolerances: Accepted errors of goals.
+        obstacles_only: Whether windows that hold for no obstacle are left out.
+    """
+    finder = _WindowFinder(samples, solids, options, tolerances)
+    if obstacles_only:
+        return list(finder.find_obstacle_windows(steps, obstacles_only=True))
+    return list(finder.find(steps))
 
 
 def check_gripper(samples: Samples, options: Options) -> Iterator[Violation]:
@@ -198,9 +212,9 @@ class _WindowFinder:
         self.samples = samples
         self.solids = solids
         self.options = options
-        self.scene = samples.scene
+        self.scene = solids.world.scene
         self.trajectory = samples.trajectory
-        self.labels = np.array(samples.world.collision_labels)
+        self.labels = np.array(solids.world.collision_labels)
         self.z = samples.z[samples.waypoint_rows]
         self.q = samples.world.coordinates.q(self.z)
         low, high = samples.ranges
@@ -212,14 +226,23 @@ class _WindowFinder:
         self.supports = samples.free_objects.supports
 
     def find(self, steps: Sequence[Step]) -> Iterator[Window]:
-        for exempt in find_exempt_pairs(self.scene, self.solids, self.options.dist_safe):
-            yield from self._find_exemption_windows(exempt)
+        yield from self.find_obstacle_windows(steps)
         holds = [set(phase.holds) for phase in self.trajectory.phases]
         for hold, first, last in self._find_spans([set(self.scene.holds), *holds]):
             yield from self._find_hold_windows(hold, first, last)
         yield from self._find_grasp_windows([step for step in steps if isinstance(step, Grasp)])
-        yield from self._find_free_object_windows()
         yield from self._find_support_windows()
+
+    def find_obstacle_windows(
+        self, steps: Sequence[Step], *, obstacles_only: bool = False
+    ) -> Iterator[Window]:
+        """Yield the windows of those kinds of contact that obstacles may have, too."""
+        exempt_pairs = find_exempt_pairs(
+            self.scene, self.solids, self.options.dist_safe, obstacles_only=obstacles_only
+        )
+        for exempt in exempt_pairs:
+            yield from self._find_exemption_windows(exempt)
+        yield from self._find_free_object_windows()
         yield from self._find_touch_windows([step for step in steps if isinstance(step, Touch)])
 
     def _find_exemption_windows(self, exempt: ExemptPairs) -> Iterator[Window]:

@@ -64,7 +64,7 @@ class ExemptPairs:
 
 
 def find_exempt_pairs(
-    scene: Scene, solids: CollisionShapes, dist_safe: float
+    scene: Scene, solids: CollisionShapes, dist_safe: float, *, obstacles_only: bool = False
 ) -> tuple[ExemptPairs, ...]:
     """Return the pairs of shapes that a scene allows to be close, and neighbours.
 
@@ -72,14 +72,15 @@ def find_exempt_pairs(
         scene: The scene.
         solids: Its shapes as one plain tree.
         dist_safe: Clearance of all other pairs [m].
+        obstacles_only: Whether neighbours that are no obstacles are left out.
     """
     states = [make_state_key(placed) for placed in scene.objects.values()]
-    key = ("exempt pairs", dist_safe, *states)
+    key = ("exempt pairs", dist_safe, obstacles_only, *states)
 
     def find() -> tuple[ExemptPairs, ...]:
         allowed = list(_list_allowed_pairs(scene, solids))
-        neighbours = list(_NeighbourSearch(scene, solids, dist_safe).find())
-        return (*allowed, *neighbours)
+        search = _NeighbourSearch(scene, solids, dist_safe, obstacles_only=obstacles_only)
+        return (*allowed, *search.find())
 
     return get_cached(scene, key, find)
 
@@ -100,10 +101,13 @@ def _list_allowed_pairs(scene: Scene, solids: CollisionShapes) -> Iterator[Exemp
 class _NeighbourSearch:
     """Compares the shapes of articulated objects with all that is fixed."""
 
-    def __init__(self, scene: Scene, solids: CollisionShapes, dist_safe: float) -> None:
+    def __init__(
+        self, scene: Scene, solids: CollisionShapes, dist_safe: float, *, obstacles_only: bool
+    ) -> None:
         self._scene = scene
         self._solids = solids
         self._dist_safe = dist_safe
+        self._obstacles_only = obstacles_only
         self._world = solids.world
         self._coordinates = solids.world.coordinates
         self._owners = [label.partition(".")[0] for label in self._world.collision_labels]
@@ -135,11 +139,12 @@ class _NeighbourSearch:
             len(placed.object.collision.geometryObjects) for placed in self._scene.objects.values()
         ]
         robot_size = len(world.bodies.geometryObjects) - sum(object_sizes)
+        first = self._solids.body_count if self._obstacles_only else robot_size
         pairs: list[tuple[int, int]] = []
         for i, columns in enumerate(self._columns):
             if not columns:
                 continue
-            for k in range(robot_size, len(world.shapes)):
+            for k in range(first, len(world.shapes)):
                 if self._is_candidate(i, k):
                     pairs.append((i, k))
         return np.array(pairs, int).reshape(-1, 2)

@@ -239,6 +239,19 @@ class Report(StoredRecord):
         return parse_document(Document(dict(check_mapping(data, "report"))), cls)
 
 
+def select_worst(violations: Sequence[Violation]) -> tuple[Violation, ...]:
+    """Return the worst violation of each constraint, subject and unit, in order of time."""
+    worst: dict[tuple[str, str, str], Violation] = {}
+    for violation in violations:
+        key = (violation.constraint, violation.subject, violation.unit)
+        if key not in worst or worst[key].amount < violation.amount:
+            worst[key] = violation
+    for violation in violations:  # a penetration implies a clearance violation
+        if violation.constraint == "penetration":
+            worst.pop(("clearance", violation.subject, violation.unit), None)
+    return tuple(sorted(worst.values(), key=lambda v: (v.time, v.constraint, v.subject, v.unit)))
+
+
 @runtime_checkable
 class CheckedMotion(Protocol):
     """A validated motion in a scene, such as a `Plan`, as shown by viewers and plots."""

@@ -7,7 +7,6 @@ most 5 mm and 0.01 rad apart, and at finer ones where a collision could hide bet
 
 from __future__ import annotations
 
-import bisect
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -16,21 +15,18 @@ import pinocchio as pin
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import check_instance
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.validation.clearance import ClearanceCheck, check_clearance
 from vkc_pin.validation.closure import find_drift
-from vkc_pin.validation.collisions import Hit, PairTable, sweep
-from vkc_pin.validation.contact_windows import check_gripper, check_pushes, find_contact_windows
-from vkc_pin.validation.distances import CollisionShapes
+from vkc_pin.validation.contact_windows import check_gripper, check_pushes
 from vkc_pin.validation.goals import MOTION_TOLERANCE, check_goals, check_steps
 from vkc_pin.validation.limits import MotorLoads, check_rates, check_rolling
 from vkc_pin.validation.loads import check_loads
-from vkc_pin.validation.neighbours import ExemptPairs, find_exempt_pairs
-from vkc_pin.validation.report import Exemption, Report, Violation
+from vkc_pin.validation.report import Report, Violation, select_worst
 from vkc_pin.validation.samples import MAX_SAMPLES, Samples
 from vkc_pin.validation.terms import check_terms
 from vkc_pin.validation.tolerances import Tolerances
 from vkc_pin.world.models.articulated_object import Latch
 from vkc_pin.world.models.shapes import START_SLACK
-from vkc_pin.world.scene.clearance_exemptions import ACCEPTED_SHORTFALL, CONTACT_DEPTH
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.scene.support import MAX_TILT, compute_tilt
 from vkc_pin.world.task.steps import Step, as_steps
@@ -106,13 +102,13 @@ def validate(
     excess = list(_check_sample_count(samples))
     if excess:
         violations += excess
-        clearance = _ClearanceCheck(samples)
+        clearance = ClearanceCheck(samples)
     else:
-        clearance = _check_clearance(samples, asked, options, tolerances)
+        clearance = check_clearance(samples, asked, options, tolerances)
         violations += clearance.violations
     motor_fields = motors.summarize(options.jerk_time)
     return Report(
-        _select_worst(violations),
+        select_worst(violations),
         float(min(clearance.smallest)),
         closure_error=float(drift[0]),
         closure_angle=float(drift[1]),
@@ -133,19 +129,6 @@ def check_arguments(
     asked = as_steps(steps)
     check_steps(samples, asked)
     return samples, asked, trace_terms(scene, terms)
-
-
-def _select_worst(violations: Sequence[Violation]) -> tuple[Violation, ...]:
-    """Return the worst violation of each constraint, subject and unit, in order of time."""
-    worst: dict[tuple[str, str, str], Violation] = {}
-    for violation in violations:
-        key = (violation.constraint, violation.subject, violation.unit)
-        if key not in worst or worst[key].amount < violation.amount:
-            worst[key] = violation
-    for violation in violations:  # a penetration implies a clearance violation
-        if violation.constraint == "penetration":
-            worst.pop(("clearance", violation.subject, violation.unit), None)
-    return tuple(sorted(worst.values(), key=lambda v: (v.time, v.constraint, v.subject, v.unit)))
 
 
 def _check_sample_count(samples: Samples) -> Iterator[Violation]:
@@ -363,97 +346,3 @@ def _check_closure(samples: Samples, tolerances: Tolerances, violations: list[Vi
                     )
                 )
     return largest
-
-
-class _ClearanceCheck:
-    """Result of the check of clearances and penetrations.
-
-    Attributes:
-        violations: All violations.
-        smallest: Smallest distance of each phase [m]; infinite without a pair.
-        exemptions: Used exemptions by the labels of their shapes.
-    """
-
-    def __init__(self, samples: Samples) -> None:
-        self._samples = samples
-        self._lasts = [phase.last for phase in samples.trajectory.phases]
-        self.violations: list[Violation] = []
-        self.smallest = np.full(len(self._lasts), np.inf)
-        self.exemptions: dict[tuple[str, str], Exemption] = {}
-
-    def add(self, hit: Hit, exempt: Sequence[ExemptPairs]) -> None:
-        """Judge the distance of a pair, with the exemptions of the pair."""
-        # The exemption also covers the segment before it ends and the one after it begins.
-        state = self._samples.z[[hit.row]]
-        tolerated = 0.0  # overlap [m]
-        for one in exempt:
-            if one.are_active(state)[0]:
-                tolerated = max(tolerated, -one.margin)
-        contact = hit.contact
-        margin = hit.margin
-        if tolerated > 0.0:
-            contact = max(contact, CONTACT_DEPTH + tolerated)
-            margin = min(margin, -tolerated)
-        elif hit.margin > -np.inf:
-            self._add_distance(hit)
-        is_checked = hit.at_waypoint and hit.row > 0
-        shortfall = margin - ACCEPTED_SHORTFALL - hit.distance
-        millimetres = 1e3 * abs(hit.distance)
-        if hit.distance < -contact:
-            detail = f"overlap by {millimetres:.1f} mm"
-            self._add_violation("penetration", hit, -hit.distance, detail)
-        elif is_checked and shortfall > 0.0:
-            required = f"{1e3 * hit.margin:.0f} mm are required"
-            detail = f"are only {millimetres:.1f} mm apart, {required}"
-            self._add_violation("clearance", hit, shortfall, detail)
-        elif hit.distance < -CONTACT_DEPTH or (
-            is_checked and hit.distance < hit.exempt_clearance - ACCEPTED_SHORTFALL
-        ):
-            self._add_exemption(hit, exempt)
-
-    def _add_distance(self, hit: Hit) -> None:
-        phase = bisect.bisect_left(self._lasts, self._samples.find_waypoint(hit.row))
-        self.smallest[phase] = min(self.smallest[phase], hit.distance)
-
-    def _add_violation(self, kind: str, hit: Hit, amount: float, detail: str) -> None:
-        subject = f"{hit.first} – {hit.second}"
-        self.violations.append(
-            self._samples.make_violation(kind, subject, amount, "m", detail, row=hit.row)
-        )
-
-    def _add_exemption(self, hit: Hit, exempt: Sequence[ExemptPairs]) -> None:
-        """Record the smallest distance of a pair that used its exemption."""
-        known = self.exemptions.get((hit.first, hit.second))
-        if known is not None and known.distance <= hit.distance:
-            return
-        reason = exempt[0].reason if exempt else "no deeper than the object at the start"
-        subject = f"{hit.first} – {hit.second}"
-        self.exemptions[hit.first, hit.second] = Exemption(subject, hit.distance, reason)
-
-
-def _check_clearance(
-    samples: Samples, steps: Sequence[Step], options: Options, tolerances: Tolerances
-) -> _ClearanceCheck:
-    """Check the clearance at waypoints (eqs. 6 and 7), and that nothing penetrates anywhere.
-
-    Pairs that move together are ignored. At the start the clearance may be violated, since the
-    robot is already there, but nothing may penetrate.
-    """
-    solids = CollisionShapes(samples.world)
-    pairs = PairTable(
-        samples.scene,
-        solids,
-        samples.trajectory,
-        options.dist_safe,
-        options.self_distance,
-        windows=find_contact_windows(samples, solids, steps, options, tolerances),
-        samples=samples,
-    )
-    exemptions: dict[tuple[int, int], list[ExemptPairs]] = {}
-    for one in find_exempt_pairs(samples.scene, solids, options.dist_safe):
-        for first, second in one.pairs.tolist():
-            exemptions.setdefault((first, second), []).append(one)
-    check = _ClearanceCheck(samples)
-    for hit in sweep(pairs, samples.z, samples.waypoint_rows):
-        check.add(hit, exemptions.get(hit.shapes, []))
-    return check

@@ -56,6 +56,24 @@ def make_obstacle_shapes(
     return [visual], [collision]
 
 
+def move_obstacle_shape(
+    item: schema.ObstacleSchema, shape: pin.GeometryObject, before: pin.SE3, after: pin.SE3
+) -> pin.GeometryObject:
+    """Return a copy of an obstacle's shape, moved with the obstacle.
+
+    Args:
+        item: Description of the obstacle.
+        shape: One of its shapes, in the world frame.
+        before: Placement of the obstacle with which the shape was made.
+        after: New placement of the obstacle.
+    """
+    placement = after
+    if item.type == "urdf":
+        # Only the links of a URDF have placements of their own in the obstacle.
+        placement = after * before.actInv(shape.placement)
+    return copy_shape(shape, shape.name, placement)
+
+
 def make_floor_shape(arena: tuple[float, float, float, float]) -> pin.GeometryObject:
     """Return the floor of an arena as a box, which, unlike a half space, can be drawn and bounded.
 

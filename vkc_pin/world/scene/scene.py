@@ -81,6 +81,7 @@ class Scene:
         obstacle_labels: Name of the obstacle of each of these shapes (`FLOOR` for the floor).
         obstacle_names: Names of the obstacles in the order of the file, without the floor.
         obstacle_visual: Visual shapes of the obstacles, without the floor.
+        obstacle_visual_labels: Name of the obstacle of each of these shapes.
         floor: Whether there is a floor at z = 0.
         arena: Part of the floor that belongs to the scene: (x_min, x_max, y_min, y_max) [m].
         start_region: Region from which `sample_start` draws, if the scene has one.
@@ -91,8 +92,8 @@ class Scene:
             robot's rest configuration.
         described: Description it was built from; source of the robot, obstacles and files in
             `document`.
-        memory: Cache of derived results, shared with the copies that the `with_` methods return;
-            affects computation times only.
+        memory: Cache of derived results, shared with the copies that the `with_` methods return,
+            except those with other obstacles; affects computation times only.
     """
 
     name: str
@@ -106,6 +107,7 @@ class Scene:
     obstacle_labels: tuple[str, ...]
     obstacle_names: tuple[str, ...]
     obstacle_visual: tuple[pin.GeometryObject, ...]
+    obstacle_visual_labels: tuple[str, ...]
     floor: bool
     arena: tuple[float, float, float, float]
     start_region: RegionSchema | None
@@ -289,6 +291,28 @@ class Scene:
         pose = as_placement(placement, name="placement")
         moved = dataclasses.replace(placed, placement=pose)
         return self._with(objects=freeze({**self.objects, name: moved}))
+
+    def with_obstacle(self, name: str, placement: Any) -> Scene:
+        """Return the scene with obstacle `name` at another placement.
+
+        All its shapes move together. Shapes, objects and robot are shared with this scene, so that
+        an obstacle may follow a measured person at every measurement. Overlaps are not checked.
+
+        Args:
+            name: Obstacle, by its name in the scene file.
+            placement: Placement of its frame in the world frame, see `as_placement`: of the centre
+                of a shape, of the origin of a mesh or URDF.
+
+        Raises:
+            UnknownNameError: There is no such obstacle. The floor is none of them.
+            InputError: `placement` is not a pose.
+        """
+        from vkc_pin.world.scene.scene_file import move_obstacle
+
+        check_choice(name, self.obstacle_names, "obstacle", "name")
+        pose = as_placement(placement, name="placement")
+        # Results in `memory` depend on the obstacles: the copy begins with none.
+        return dataclasses.replace(self, **move_obstacle(vars(self), name, pose))
 
     def with_held(
         self,

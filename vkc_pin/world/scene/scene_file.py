@@ -34,7 +34,12 @@ from vkc_pin.world.scene.hold import (
     place_held_objects,
     resolve_holds,
 )
-from vkc_pin.world.scene.obstacles import FLOOR, make_floor_shape, make_obstacle_shapes
+from vkc_pin.world.scene.obstacles import (
+    FLOOR,
+    make_floor_shape,
+    make_obstacle_shapes,
+    move_obstacle_shape,
+)
 from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.start_velocity import make_start_velocity
 
@@ -52,9 +57,11 @@ def make_scene_fields(document: Document, folder: Path) -> dict[str, Any]:
     obstacles = list[pin.GeometryObject]()
     labels = list[str]()
     visual = list[pin.GeometryObject]()
+    visual_labels = list[str]()
     for index, item in enumerate(description.obstacles):
         visual_shapes, shapes = _load_obstacle(document, ("obstacles", index), item, folder)
         visual += visual_shapes
+        visual_labels += [item.name] * len(visual_shapes)
         obstacles += shapes
         labels += [item.name] * len(shapes)
     if description.floor:
@@ -75,6 +82,7 @@ def make_scene_fields(document: Document, folder: Path) -> dict[str, Any]:
         "obstacle_labels": tuple(labels),
         "obstacle_names": tuple(item.name for item in description.obstacles),
         "obstacle_visual": tuple(visual),
+        "obstacle_visual_labels": tuple(visual_labels),
         "floor": description.floor,
         "arena": arena,
         "start_region": description.start_region,
@@ -132,6 +140,51 @@ def make_document(fields: Mapping[str, Any]) -> dict[str, Any]:
     if plain["allow"]:
         document["allow"] = plain["allow"]
     return document
+
+
+def move_obstacle(fields: Mapping[str, Any], name: str, placement: pin.SE3) -> dict[str, Any]:
+    """Return the attributes of a scene that change when an obstacle moves, by name.
+
+    The moved obstacle is described by position and rpy, and placed as this description says, so
+    that a saved scene has the same placement.
+
+    Args:
+        fields: Attributes of a `Scene`, by name.
+        name: Name of the obstacle.
+        placement: Its new placement in the world frame.
+    """
+    described = fields["described"]
+    index = fields["obstacle_names"].index(name)
+    item = described.obstacles[index]
+    pose = {
+        "position": tuple(placement.translation.tolist()),
+        "rpy": tuple(pin.rpy.matrixToRpy(placement.rotation).tolist()),
+        "yaw": None,
+        "quaternion": None,
+    }
+    moved_item = item.model_copy(update=pose)
+    before = _make_pose(item)
+    after = _make_pose(moved_item)
+
+    def move_shapes(
+        shapes: Sequence[pin.GeometryObject], labels: Sequence[str]
+    ) -> tuple[pin.GeometryObject, ...]:
+        moved = list(shapes)
+        for k, label in enumerate(labels):
+            if label == name:
+                moved[k] = move_obstacle_shape(item, shapes[k], before, after)
+        return tuple(moved)
+
+    obstacles = (
+        *described.obstacles[:index],
+        moved_item,
+        *described.obstacles[index + 1 :],
+    )
+    return {
+        "obstacles": move_shapes(fields["obstacles"], fields["obstacle_labels"]),
+        "obstacle_visual": move_shapes(fields["obstacle_visual"], fields["obstacle_visual_labels"]),
+        "described": described.model_copy(update={"obstacles": obstacles}),
+    }
 
 
 def _describe_hold(hold: Hold, objects: Mapping[str, PlacedObject]) -> dict[str, Any]:

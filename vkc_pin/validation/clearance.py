@@ -1,0 +1,159 @@
+"""Checks the clearances of a motion at its waypoints, and that nothing penetrates anywhere."""
+
+from __future__ import annotations
+
+import bisect
+from collections.abc import Sequence
+
+import numpy as np
+
+from vkc_pin.options import Options
+from vkc_pin.validation.collisions import Hit, PairTable, sweep
+from vkc_pin.validation.contact_windows import find_contact_windows
+from vkc_pin.validation.distances import CollisionShapes
+from vkc_pin.validation.neighbours import ExemptPairs, find_exempt_pairs
+from vkc_pin.validation.report import Exemption, Violation
+from vkc_pin.validation.samples import Samples
+from vkc_pin.validation.tolerances import Tolerances
+from vkc_pin.world.scene.clearance_exemptions import ACCEPTED_SHORTFALL, CONTACT_DEPTH
+from vkc_pin.world.task.steps import Step
+from vkc_pin.world.trajectory.world_model import World
+
+
+class ClearanceCheck:
+    """Result of the check of clearances and penetrations.
+
+    Attributes:
+        smallest: Smallest distance of each phase [m]; infinite without a pair.
+        exemptions: Used exemptions by the labels of their shapes.
+    """
+
+    def __init__(self, samples: Samples) -> None:
+        self._samples = samples
+        self._lasts = [phase.last for phase in samples.trajectory.phases]
+        self._waypoint_rows = samples.waypoint_rows.tolist()
+        # The worst hit of each constraint and pair of links, with the amount of its violation.
+        self._worst: dict[tuple[str, str, str], tuple[Hit, float]] = {}
+        self.smallest = np.full(len(self._lasts), np.inf)
+        self.exemptions: dict[tuple[str, str], Exemption] = {}
+
+    def add(self, hit: Hit, exempt: Sequence[ExemptPairs]) -> None:
+        """Judge the distance of a pair, with the exemptions of the pair."""
+        # The exemption also covers the segment before it ends and the one after it begins.
+        state = self._samples.z[[hit.row]]
+        tolerated = 0.0  # overlap [m]
+        for one in exempt:
+            if one.are_active(state)[0]:
+                tolerated = max(tolerated, -one.margin)
+        contact = hit.contact
+        margin = hit.margin
+        if tolerated > 0.0:
+            contact = max(contact, CONTACT_DEPTH + tolerated)
+            margin = min(margin, -tolerated)
+        elif hit.margin > -np.inf:
+            self._add_distance(hit)
+        is_checked = hit.at_waypoint and hit.row > 0
+        shortfall = margin - ACCEPTED_SHORTFALL - hit.distance
+        if hit.distance < -contact:
+            self._add_violation("penetration", hit, -hit.distance)
+        elif is_checked and shortfall > 0.0:
+            self._add_violation("clearance", hit, shortfall)
+        elif hit.distance < -CONTACT_DEPTH or (
+            is_checked and hit.distance < hit.exempt_clearance - ACCEPTED_SHORTFALL
+        ):
+            self._add_exemption(hit, exempt)
+
+    def _add_distance(self, hit: Hit) -> None:
+        waypoint = bisect.bisect_right(self._waypoint_rows, hit.row) - 1
+        phase = bisect.bisect_left(self._lasts, waypoint)
+        self.smallest[phase] = min(self.smallest[phase], hit.distance)
+
+    def _add_violation(self, kind: str, hit: Hit, amount: float) -> None:
+        key = (kind, hit.first, hit.second)
+        known = self._worst.get(key)
+        if known is None or known[1] < amount:
+            self._worst[key] = (hit, amount)
+
+    @property
+    def violations(self) -> list[Violation]:
+        """Worst violation of each constraint and pair of links."""
+        found = list[Violation]()
+        for (kind, first, second), (hit, amount) in self._worst.items():
+            millimetres = 1e3 * abs(hit.distance)
+            detail = f"overlap by {millimetres:.1f} mm"
+            if kind == "clearance":
+                required = f"{1e3 * hit.margin:.0f} mm are required"
+                detail = f"are only {millimetres:.1f} mm apart, {required}"
+            subject = f"{first} – {second}"
+            found.append(
+                self._samples.make_violation(kind, subject, amount, "m", detail, row=hit.row)
+            )
+        return found
+
+    def _add_exemption(self, hit: Hit, exempt: Sequence[ExemptPairs]) -> None:
+        """Record the smallest distance of a pair that used its exemption."""
+        known = self.exemptions.get((hit.first, hit.second))
+        if known is not None and known.distance <= hit.distance:
+            return
+        reason = exempt[0].reason if exempt else "no deeper than the object at the start"
+        subject = f"{hit.first} – {hit.second}"
+        self.exemptions[hit.first, hit.second] = Exemption(subject, hit.distance, reason)
+
+
+def check_clearance(
+    samples: Samples,
+    steps: Sequence[Step],
+    options: Options,
+    tolerances: Tolerances,
+    *,
+    obstacles: World | None = None,
+    first_row: int = 0,
+) -> ClearanceCheck:
+    """Check the clearance at waypoints (eqs. 6 and 7), and that nothing penetrates anywhere.
+
+    Pairs that move together are ignored. At the start the clearance may be violated, since the
+    robot is already there, but nothing may penetrate.
+
+    Args:
+        samples: Sampled motion.
+        steps: Steps of the motion.
+        options: Clearances to keep.
+        tolerances: Accepted errors of goals.
+        obstacles: World with the robot and the objects of the samples, whose obstacles are checked
+            instead of theirs, and nothing else. Default: all pairs of the samples are checked.
+        first_row: First sample that is checked.
+    """
+    obstacles_only = obstacles is not None
+    world = samples.world if obstacles is None else obstacles
+    solids = CollisionShapes(world)
+    pairs = PairTable(
+        world.scene,
+        solids,
+        samples.trajectory,
+        options.dist_safe,
+        options.self_distance,
+        windows=find_contact_windows(
+            samples, solids, steps, options, tolerances, obstacles_only=obstacles_only
+        ),
+        samples=samples,
+        obstacles_only=obstacles_only,
+    )
+    exempt_pairs = find_exempt_pairs(
+        world.scene, solids, options.dist_safe, obstacles_only=obstacles_only
+    )
+    exemptions: dict[tuple[int, int], list[ExemptPairs]] = {}
+    for one in exempt_pairs:
+        for first, second in one.pairs.tolist():
+            exemptions.setdefault((first, second), []).append(one)
+    check = ClearanceCheck(samples)
+    hits = sweep(
+        pairs,
+        samples.z,
+        samples.waypoint_rows,
+        first=samples.find_waypoint(first_row),
+        close_only=obstacles_only,
+    )
+    for hit in hits:
+        if hit.row >= first_row:
+            check.add(hit, exemptions.get(hit.shapes, []))
+    return check

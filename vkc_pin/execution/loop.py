@@ -162,7 +162,9 @@ class _Loop:
         finding = monitor.check(float(self._first.trajectory.times[0]), state, None)
         if finding.reason:
             expected = "a robot at the start of the plan"
-            raise InputError("not at its start", field="robot", expected=expected, got=finding.reason)
+            raise InputError(
+                "not at its start", field="robot", expected=expected, got=finding.reason
+            )
         self._send(self._first, state.time + self._period)
         next_cycle = state.time + self._period
         reason = ""
@@ -241,7 +243,7 @@ class _Loop:
 
     def _brake(self, now: float, reason: str) -> tuple[Decision, str]:
         """Send a braking motion on the path."""
-        begin, plan = self._sent[-1]
+        plan = self._plan
         clock = self._robot.read().time + _BRAKE_DELAY
         motion_time = self._get_motion_time(clock)
         try:

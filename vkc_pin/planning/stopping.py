@@ -14,6 +14,7 @@ from vkc_pin.world.task.steps import Actuate, Configure, Step
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import find_phase_at
 
 _TICK = 2e-3  # [s] between knots of the braking motion
 # Share of the acceleration limits that is used: between knots, a cubic may exceed what it has
@@ -73,18 +74,28 @@ def _find_strongest_braking(velocity: Floats, curvature: Floats, limit: Floats) 
 
 def _run_through(motion: Trajectory, clocks: Floats, rates: Floats) -> Trajectory:
     """Return a motion that is at q(clocks) after every tick, with the velocities rates·q'."""
-    times = _TICK * np.arange(len(clocks))
+    times = _TICK * np.arange(len(clocks), dtype=float)
     positions = motion.at(clocks)
     curve = Curve(times, positions, rates[:, None] * motion.velocity(clocks))
+    spans = _split_into_phases(motion, clocks)
+    return Trajectory(motion.names, times, positions, spans, motion.robot_size, curve)
+
+
+def _split_into_phases(motion: Trajectory, clocks: Floats) -> tuple[PhaseSpan, ...]:
+    """Return the phases of a motion as spans of rows at its times `clocks`."""
+    end = len(clocks) - 1
+    current = motion.phases.index(find_phase_at(motion, float(clocks[0])))
     spans = list[PhaseSpan]()
     first = 0
-    for phase in motion.phases:
+    for phase in motion.phases[current:]:
         last = int(np.searchsorted(clocks, motion.times[phase.last]))
-        last = min(last, len(clocks) - 1)
-        if last > first:
+        if first < last < end:
             spans.append(replace(phase, first=first, last=last))
             first = last
-    return Trajectory(motion.names, times, positions, tuple(spans), motion.robot_size, curve)
+        elif last >= end or not spans:  # in a pause for the gripper, the phase before it goes on
+            spans.append(replace(phase, first=first, last=end))
+            break
+    return tuple(spans)
 
 
 def list_steps_of_stop(scene: Scene, motion: Trajectory) -> tuple[Step, ...]:

@@ -82,9 +82,7 @@ def _evaluate_profile(fractions: Floats, *, smooth: bool) -> tuple[Floats, Float
     return shares, distances
 
 
-def _brake_along_arc(
-    position: Floats, velocity: Floats, duration: float, limits: Limits
-) -> Curve:
+def _brake_along_arc(position: Floats, velocity: Floats, duration: float, limits: Limits) -> Curve:
     """Return a curve of `make_braking_curve` for a base on wheels."""
     fractions = np.linspace(0.0, 1.0, _CUBICS_OF_ARC + 1)
     shares, distances = _evaluate_profile(fractions, smooth=not limits.has_unlimited_jerk)

@@ -102,6 +102,8 @@ class World:
             for name, obj in self.objects.items()
             for joint, value in obj.state.items()
         }
+        names = plan.names[: plan.robot_size]
+        self.start_velocity = dict.fromkeys(names, 0.0) | (start.get("velocity") or {})
         self.held: list[Hold] = []
         self.measured: dict[str, Grasp] = {}
         for name, start_grasp in (start.get("held") or {}).items():

@@ -24,8 +24,9 @@ _MOTION_TOLERANCE = 1e-9
 _MIN_SHARE = 5e-3
 # relative excess over a limit
 ACCEPTED_RATE_TOLERANCE = 1e-3
-# speed at the ends [m/s] or [rad/s]
+# deviation of the velocity at the ends [m/s] or [rad/s]
 REST_TOLERANCE = 1e-6
+_END_TEXT = "{value} from the velocity that is required there"
 # jump of an acceleration, relative to its limit
 JUMP_TOLERANCE = 1e-3
 # Relative excess over a limit. Torques are evaluated only at three times of every cubic.
@@ -111,9 +112,10 @@ def _find_longest_stretch(times: Floats, labels: Ints, label: int) -> tuple[floa
 def check_rates(samples: Samples, options: Options) -> Iterator[Violation]:
     """Yield the worst violations of velocity and acceleration limits (eq. 5) and of jerk limits.
 
-    A curve must begin and end at rest. Accelerations are evaluated at the ends of its cubics, where
-    they are largest. The jerk of each cubic is constant; with jerk limits, accelerations must not
-    jump between cubics. Jerks of a motion without a curve are not checked, as its velocities jump.
+    A curve must begin with the velocity of the scene's start and end at rest. Accelerations are
+    evaluated at the ends of its cubics, where they are largest. The jerk of each cubic is constant;
+    with jerk limits, accelerations must not jump between cubics. Jerks of a motion without a curve
+    are not checked, as its velocities jump.
     """
     motion = samples.trajectory
     curve = motion.curve
@@ -121,12 +123,13 @@ def check_rates(samples: Samples, options: Options) -> Iterator[Violation]:
     jerks: tuple[Floats, Floats] | None = None
     if curve is None:
         moments = motion.times
-        end_speeds = np.zeros((2, len(motion.names)))
+        end_errors = np.zeros((2, len(motion.names)))
         velocities = motion.velocities()
-        accelerations = motion.accelerations()
+        accelerations = motion.accelerations(samples.estimate_start_velocity())
     else:
         moments = curve.times
-        end_speeds = np.abs(curve.rates[[0, -1]])
+        end_errors = curve.rates[[0, -1]] - [samples.start_velocity, np.zeros(len(motion.names))]
+        end_errors = np.nan_to_num(np.abs(end_errors))
         velocities, accelerations = curve.compute_max_rates()
         if options.jerk_time > 0.0:
             jerks = curve.compute_jerks()
@@ -135,7 +138,7 @@ def check_rates(samples: Samples, options: Options) -> Iterator[Violation]:
         checks = [
             _RateCheck("velocity", velocities[:, i], max_speed, "s", moments),
             _RateCheck("acceleration", accelerations[:, i], max_acceleration, "s²", moments),
-            _RateCheck("velocity", end_speeds[:, i], REST_TOLERANCE, "s", ends),
+            _RateCheck("velocity", end_errors[:, i], REST_TOLERANCE, "s", ends, _END_TEXT),
         ]
         if jerks is not None and np.isfinite(max_acceleration):
             inside, jumps = jerks
@@ -156,6 +159,7 @@ class _RateCheck(NamedTuple):
         limit: Limit of their magnitudes.
         per: What follows "m/" or "rad/" in their unit.
         times: Times of the values [s], shape (K,) or more.
+        text: Text of a violation.
     """
 
     kind: str
@@ -163,6 +167,7 @@ class _RateCheck(NamedTuple):
     limit: float
     per: str
     times: Floats
+    text: str = "{value} is more than {limit}"
 
 
 def _check_rate(samples: Samples, name: str, check: _RateCheck) -> Iterator[Violation]:
@@ -174,7 +179,7 @@ def _check_rate(samples: Samples, name: str, check: _RateCheck) -> Iterator[Viol
         return
     before = int(np.searchsorted(samples.trajectory.times, check.times[worst], side="right")) - 1
     unit = f"{samples.get_unit(name)}/{check.per}"
-    detail = f"{value:.3f} {unit} is more than {limit:.3f} {unit}"
+    detail = check.text.format(value=f"{value:.3f} {unit}", limit=f"{limit:.3f} {unit}")
     yield samples.make_violation(
         check.kind, name, value - limit, unit, detail, waypoint=max(before, 0)
     )
@@ -196,15 +201,18 @@ class MotorLoads:
             return sample_curve(trajectory.curve)
         count = len(trajectory.times)
         segments = np.minimum(np.arange(count), count - 2)
-        # The velocity at a waypoint is the mean of those before and after it, at rest outside.
+        # The velocity at a waypoint is the mean of those before and after it: before the motion it
+        # is the start's, after it zero.
+        start_velocity = self.samples.estimate_start_velocity()
         speeds = np.pad(trajectory.velocities(), ((1, 1), (0, 0)))
+        speeds[0] = start_velocity
         velocities = 0.5 * (speeds[1:] + speeds[:-1])
         return MotionSamples(
             trajectory.times,
             segments,
             trajectory.positions,
             velocities,
-            trajectory.accelerations(),
+            trajectory.accelerations(start_velocity),
         )
 
     @cached_property

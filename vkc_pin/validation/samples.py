@@ -278,6 +278,29 @@ class Samples:
             float(item.acceleration[i]),
         )
 
+    @cached_property
+    def start_velocity(self) -> Floats:
+        """Velocity of the trajectory's coordinates with which the motion must begin, shape (n,).
+
+        That of a held object's joints and of its grasp follows from the hand's, which the closure
+        determines: it is NaN if the robot moves.
+        """
+        velocity = np.zeros(len(self.trajectory.names))
+        robot_velocity = self.scene.start_velocity
+        if not robot_velocity.any():
+            return velocity
+        velocity[: len(robot_velocity)] = robot_velocity
+        for k, name in enumerate(self.trajectory.names):
+            owner, separator, _ = name.partition(".")
+            if separator and owner in self.scene.held:
+                velocity[k] = np.nan
+        return velocity
+
+    def estimate_start_velocity(self) -> Floats:
+        """Return `start_velocity`, with the first segment's mean velocity where that is unknown."""
+        is_known = ~np.isnan(self.start_velocity)
+        return np.where(is_known, self.start_velocity, self.trajectory.velocities()[0])
+
     def find_waypoint(self, row: int) -> int:
         """Return the last waypoint at or before a sample."""
         return int(np.searchsorted(self.waypoint_rows, row, side="right")) - 1

@@ -71,7 +71,10 @@ def test_amounts_equal_the_violations_of_each_kind(seed: int) -> None:
     terms = p.term_evaluator.compute_violation(z, timing.dt)
     assert found.amounts["terms"].max() == pytest.approx(terms)
     limits = (timing.velocity, timing.acceleration)
-    excess = [np.maximum(np.abs(r) - m, 0.0).sum() for r, m in zip(p.rates(z, timing.dt), limits, strict=True)]
+    excess = [
+        np.maximum(np.abs(r) - m, 0.0).sum()
+        for r, m in zip(p.rates(z, timing.dt), limits, strict=True)
+    ]
     assert found.amounts["rates"].sum() == pytest.approx(sum(excess))
     assert np.abs(found.rate_excess).sum() == pytest.approx(sum(excess))
 

@@ -335,7 +335,9 @@ def test_rate_violation_equals_that_of_the_trajectory(
     velocity = np.abs(trajectory.velocities()) / chain.velocity
     acceleration = np.abs(trajectory.accelerations()) / chain.acceleration
     expected = max(velocity.max(), acceleration.max()) - 1.0
-    assert timing.compute_violation(*opening.rates(z, timing.dt)) == pytest.approx(expected, rel=1e-9)
+    assert timing.compute_violation(*opening.rates(z, timing.dt)) == pytest.approx(
+        expected, rel=1e-9
+    )
 
 
 def test_repr_names_phases_and_sizes(opening: TrajectoryProblem) -> None:

@@ -203,7 +203,10 @@ def test_rows_and_costs_equal_the_expressions_at_the_waypoints(name: str) -> Non
             np.testing.assert_allclose(rows[at], relaxed, atol=atol)
             count += len(at)
     assert count == len(p.term_evaluator.rows)
-    squares = [np.sum(w * part**2) for w, part in zip(point.weights, p.rates(point.z, point.dt), strict=True)]
+    squares = [
+        np.sum(w * part**2)
+        for w, part in zip(point.weights, p.rates(point.z, point.dt), strict=True)
+    ]
     assert point.cost() == pytest.approx(cost + sum(squares) + point.penalties, rel=1e-6)
     steps = p.rates(point.z, point.dt)
     assert p.objective(point.z, dt) == pytest.approx(p.motion_cost.value(*steps) + cost, rel=1e-6)

@@ -55,9 +55,9 @@ class Differences(NamedTuple):
     """Matrices D, E, U and vectors d, e that map a motion to its steps and their changes.
 
     D·z + d·z_0 are the steps δz_t = z_t − z_{t−1} of z_1..z_N. E·z + e·z_0 + U·u are their changes
-    δz_{t+1} − δz_t: between steps, from and to rest, δz = 0, where the motion stops, and from u_0 to
-    the first and from the last step to u_1, where it starts and ends: u_0 = v_0·dt_1 and u_1 =
-    v_N·dt_N are the steps of its start and end velocity.
+    δz_{t+1} − δz_t: between steps, and from and to rest, δz = 0, where the motion stops. The first
+    change is from u_0 = v_0·dt_1, the step of the start velocity, the last one to u_1 = v_N·dt_N,
+    that of the velocity at the end.
 
     Attributes:
         first: D, shape (N, N).

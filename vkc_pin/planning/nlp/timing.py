@@ -146,8 +146,8 @@ def compute_step_times(
 
     A run's duration follows from the profile 3s² − 2s³ over the distance that each coordinate
     covers in it: the peak velocity is 1.5 times the mean, the peak acceleration 6 times the
-    distance d divided by the squared duration T. A cubic with velocities v and w at its ends has the
-    peak acceleration 6d/T² + (4|v| + 2|w|)/T at most, where |v| ≥ |w|.
+    distance d divided by the squared duration T. A cubic with velocities v and w at its ends has
+    the peak acceleration 6d/T² + (4|v| + 2|w|)/T at most, where |v| ≥ |w|.
 
     Args:
         path: z_0..z_N, shape (N + 1, n).

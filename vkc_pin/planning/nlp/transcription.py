@@ -5,9 +5,9 @@ one relaxation variable e: x = (z_1, s_1, e_1, ..., z_N, s_N, e_N). With e = 1 t
 violate all its other constraints by as much as the iterate at which the program was set up; with e
 = 0 they hold exactly. Slacks and relaxation variables are penalised in the objective, which makes
 it an exact ℓ1 penalty function. Whatever differs between two tasks of the same structure is a
-parameter or a bound: start, velocities at the ends, targets, witness planes, penalty weights. The rows come from one small
-SX function per kind of waypoint, mapped over the waypoints. Its exact Hessian is that of
-λᵀ·C·vec(M(z)) plus the pose rows, regardless of the number of witness planes.
+parameter or a bound: start, velocities at the ends, targets, witness planes, penalty weights. The
+rows come from one small SX function per kind of waypoint, mapped over the waypoints. Its exact
+Hessian is that of λᵀ·C·vec(M(z)) plus the pose rows, regardless of the number of witness planes.
 """
 
 from __future__ import annotations

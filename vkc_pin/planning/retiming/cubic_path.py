@@ -67,8 +67,8 @@ FREE_ENDS: EndSlopes = (None, None)
 def compute_natural_slopes(x: Floats, y: Floats, end_slopes: EndSlopes = FREE_ENDS) -> Floats:
     """Return the slopes at knots of the cubic spline that is twice differentiable.
 
-    Its second derivative is zero at ends whose slopes are free. With h_k = x_{k+1} - x_k, continuity of the second
-    derivative at knot k is
+    Its second derivative is zero at ends whose slopes are free. With h_k = x_{k+1} - x_k,
+    continuity of the second derivative at knot k is
 
         h_k d_{k-1} + 2 (h_{k-1} + h_k) d_k + h_{k-1} d_{k+1} = 3 (h_k c_{k-1} + h_{k-1} c_k)
 

@@ -41,6 +41,8 @@ _TORQUE_TOLERANCE = 0.02
 # Attempts to keep the limits with velocities at the ends, and relative margin of each
 _TIGHTENINGS = 8
 _TIGHTENING_MARGIN = 1.002
+# Path velocities at the ends that are tried, relative to the speed of the scaled coordinates there
+_END_SPEED_RATIOS = (1.0, 0.5, 0.25)
 # [m/s], lateral velocity of a wheeled base that needs no more knots, a fifth of what counts as slip
 _MAX_SLIP = 2e-4
 _MAX_REFINEMENT = 8  # of the knots
@@ -62,11 +64,11 @@ def retime_trajectory(
 ) -> Trajectory:
     """Return a smooth trajectory through the same waypoints, as fast as its limits allow.
 
-    It starts and ends with given velocities, rests during steps without motion, and stops where a joint of an
-    object starts or ceases to move, since the hand changes direction there; with jerk limits also
-    before and after a step that is far shorter than its neighbour. A step without motion
-    at the begin of a phase, as when a hand opens, keeps its duration. Between stops it follows
-    `fit_path` at the speeds of `compute_speeds`, or else straight lines with stops at all
+    It starts and ends with given velocities, rests during steps without motion, and stops where a
+    joint of an object starts or ceases to move, since the hand changes direction there; with jerk
+    limits also before and after a step that is far shorter than its neighbour. A step without
+    motion at the begin of a phase, as when a hand opens, keeps its duration. Between stops it
+    follows `fit_path` at the speeds of `compute_speeds`, or else straight lines with stops at all
     waypoints; a wheeled base follows `fit_rolling_paths`. The resulting cubics are slowed down
     until they keep the velocity and acceleration limits exactly, and the torque limits if possible.
     `limit_jerk` limits their jerk. For velocities at the ends see `_follow_between_velocities`.
@@ -232,20 +234,51 @@ def _retime_between_velocities(
     scale: Floats,
     torque_bounds: TorqueBounds | None,
 ) -> tuple[Curve, Ints] | None:
-    """Return a curve through waypoints, (m, n), that has given velocities at both ends, or None.
+    """Return the fastest curve through waypoints, (m, n), with given velocities at both ends.
 
-    It cannot be slowed down, since its ends have their velocities. If its cubics exceed limits
-    between the positions of TOPP-RA, that gets tighter ones.
+    The slope q′ of the path at an end and the path velocity w there have the product q̇ = q′w. If w
+    is that of the scaled coordinates, q′ has length 1. Steeper paths with smaller w are tried, too:
+    their accelerations q″w² at the end are smaller, since coordinates that do not move there yet
+    have more time to follow.
+
+    Returns:
+        The curve and the knots of the waypoints, or None if no path has a timing.
     """
     lengths = np.linalg.norm(np.diff(points, axis=0) * scale, axis=1)
     if (lengths <= _MIN_STEP_DURATION).any():
         return None
-    # The path is parametrised by its length: the path velocity is that of the scaled coordinates.
-    first_speed, last_speed = np.linalg.norm(velocities * scale, axis=1).tolist()
-    first_slope = velocities[0] / first_speed if first_speed > 0.0 else None
-    last_slope = velocities[1] / last_speed if last_speed > 0.0 else None
-    path = fit_path(points, scale, (limits.lower, limits.upper), (first_slope, last_slope))
-    places = _choose_places(path, len(points) - 1)
+    speeds = np.linalg.norm(velocities * scale, axis=1)
+    curves = []
+    for ratio in _END_SPEED_RATIOS:
+        first_speed, last_speed = (ratio * speeds).tolist()
+        first_slope = velocities[0] / first_speed if first_speed > 0.0 else None
+        last_slope = velocities[1] / last_speed if last_speed > 0.0 else None
+        path = fit_path(points, scale, (limits.lower, limits.upper), (first_slope, last_slope))
+        curve = _follow_between_speeds(
+            path, len(points) - 1, velocities, (first_speed, last_speed), limits, torque_bounds
+        )
+        if curve is not None:
+            curves.append(curve)
+    if not curves:
+        return None
+    fastest = min(curves, key=lambda curve: float(curve.times[-1]))
+    return _pass_through(points, fastest)
+
+
+def _follow_between_speeds(
+    path: CubicPath,
+    steps: int,
+    velocities: Floats,
+    end_speeds: tuple[float, float],
+    limits: Limits,
+    torque_bounds: TorqueBounds | None,
+) -> Curve | None:
+    """Return the curve along a path of equal steps with given path velocities at its ends, or None.
+
+    It cannot be slowed down, since its ends have their velocities, shape (2, n). If its cubics
+    exceed limits between the positions of TOPP-RA, that gets tighter ones.
+    """
+    places = _choose_places(path, steps)
     slower = 1.0
     for _ in range(_TIGHTENINGS):
         speeds = compute_speeds(
@@ -253,7 +286,7 @@ def _retime_between_velocities(
             places,
             limits.velocity / slower,
             limits.acceleration / slower**2,
-            end_speeds=(first_speed, last_speed),
+            end_speeds=end_speeds,
         )
         if speeds is None:
             return None
@@ -265,7 +298,7 @@ def _retime_between_velocities(
         if excess <= 1.0 + 2.0 * _ROUNDING:
             if torque_bounds is not None and np.abs(torque_bounds.evaluate(curve)).max() > 1.0:
                 return None
-            return _pass_through(points, curve)
+            return curve
         slower *= _TIGHTENING_MARGIN * excess
     return None
 

@@ -168,8 +168,8 @@ class Scene:
     ) -> Scene:
         """Return the scene with another robot, which starts at the same place and holds nothing.
 
-        It starts at rest. Its arm is at home, and its gripper as in the rest configuration. For other arguments of
-        `load_robot`, give the path of a robot.yaml.
+        It starts at rest. Its arm is at home, and its gripper as in the rest configuration. For
+        other arguments of `load_robot`, give the path of a robot.yaml.
 
         Args:
             name: Name of the robot, or path of its folder, robot.yaml or URDF; see `load_robot`.

@@ -236,8 +236,8 @@ class HeldSchema(Schema):
 class StartSchema(Schema):
     """The start: base [x, y, yaw], arm joints [rad], and object → attachment or hold.
 
-    Arm joints that a mapping does not name are as in the robot's home configuration. `velocity` maps
-    coordinates of the robot to their velocities [m/s], [rad/s]; the others are at rest.
+    Arm joints that a mapping does not name are as in the robot's home configuration. `velocity`
+    maps coordinates of the robot to their velocities [m/s], [rad/s]; the others are at rest.
     `z` is the constant height of the robot's root link [m]; default: the robot's own. `opening` is
     the gripper opening [m]; default: that of the robot's rest configuration.
     """

@@ -173,7 +173,7 @@ class Curve:
     def compute_jerks(self) -> tuple[Floats, Floats]:
         """Compute |jerk| of each cubic, shape (K − 1, n), and acceleration jumps at knots, (K, n).
 
-        Before the first and after the last knot the motion is at rest.
+        Before the first and after the last knot there is no acceleration.
         """
         h = np.diff(self.times)[:, None]
         begin, end = self.compute_accelerations()

@@ -184,15 +184,17 @@ class Trajectory:
         """Return the mean velocity of every segment, shape (T − 1, n), [m/s] and [rad/s]."""
         return np.asarray(np.diff(self.positions, axis=0) / np.diff(self.times)[:, None])
 
-    def accelerations(self) -> Floats:
+    def accelerations(self, start_velocity: Floats | None = None) -> Floats:
         """Return the accelerations at waypoints as in eq. 5, shape (T, n), [m/s²] and [rad/s²].
 
         They are differences of mean velocities over the shorter of both segments' durations. The
-        motion starts and ends at rest. For accelerations of the curve see `acceleration`.
+        motion starts with a velocity, shape (n,), by default at rest, and ends at rest. For
+        accelerations of the curve see `acceleration`.
         """
         durations = np.diff(self.times)
         rest = np.zeros(len(self.names))
-        velocity = np.vstack([rest, self.velocities(), rest])
+        begin = rest if start_velocity is None else start_velocity
+        velocity = np.vstack([begin, self.velocities(), rest])
         shorter = np.minimum(durations[1:], durations[:-1])
         spans = np.concatenate([durations[:1], shorter, durations[-1:]])
         return np.asarray(np.diff(velocity, axis=0) / spans[:, None])

@@ -275,7 +275,7 @@ class _Loop:
         end = float(self._plan.trajectory.times[-1])
         scene = self._look(self._plan.scene_at(end))
         prepared = prepare(scene, steps, options=self._first.options, planner=self._planner)
-        found = prepared.solve(guess=guess, time_limit=max(self._lead, 1.0))
+        found = prepared.solve(guess=guess, time_limit=max(self._lead, 1.0), explain=False)
         if not found.success:
             return "wait", found.status
         self._waiting = None

@@ -196,6 +196,7 @@ class PreparedTask:
         seed: int = 0,
         perturbation: float = 0.0,
         progress: bool = False,
+        explain: bool = True,
     ) -> Plan:
         """Plan the steps; see `plan`.
 
@@ -210,11 +211,15 @@ class PreparedTask:
             seed: Random seed.
             perturbation: Standard deviation of noise on initial guesses.
             progress: Show a progress line.
+            explain: Whether a failure has the best motion that was found, validated, and notes on
+                its causes. That may take longer than `time_limit`; otherwise its motion stands
+                still.
 
         Raises:
             InputError: An argument is invalid, or the steps are impossible in this scene.
         """
         scene = self.scene if scene is None else check_instance(scene, Scene, "scene")
+        explain = check_bool(explain, "explain")
         budget = make_budget(time_limit, max_evaluations)
         request = make_request(
             scene,
@@ -231,7 +236,7 @@ class PreparedTask:
             show_progress(progress) as line,
             budget.activate(),
         ):
-            request = dataclasses.replace(request, progress=line, cache=cache)
+            request = dataclasses.replace(request, progress=line, cache=cache, explains=explain)
             tasks = self.compile(scene)
             holds = [hold for task in tasks for hold in task.holds if hold.by is not None]
             # Attachments approached from inside the object are reversed, with a warning.

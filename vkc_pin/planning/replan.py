@@ -46,7 +46,8 @@ def replan(
             velocity. Default: the scene's.
         scene: The world as it is at that time: `plan.scene_at(time)`, changed by what was measured.
             Default: that scene itself.
-        time_limit: Wall-clock limit [s]; see `plan`.
+        time_limit: Wall-clock limit [s]; see `plan`. If there is one, a failure is not explained,
+            which may take longer.
         planner: Planner whose caches are used.
 
     Returns:
@@ -73,7 +74,9 @@ def replan(
     motion = plan.trajectory
     rest = extract_times(motion, time, float(motion.times[-1]))
     prepared = prepare(now, steps, options=plan.options, terms=plan.terms, planner=planner)
-    return prepared.solve(guess=rest, time_limit=time_limit, seed=plan.seed)
+    return prepared.solve(
+        guess=rest, time_limit=time_limit, seed=plan.seed, explain=time_limit is None
+    )
 
 
 def _check_scene(plan: Plan, scene: Scene) -> Scene:

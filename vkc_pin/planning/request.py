@@ -38,6 +38,8 @@ class PlanningRequest:
 
     Attributes:
         guess: Motion from which the search starts, if any.
+        explains: Whether a failure has the best motion that was found, validated, and notes on its
+            causes; else it has a motion that stands still. To find causes may take seconds.
         wants_draft: Whether a converged solution is returned as a `Draft`.
         effort: Factor of the collision checks of searches with trees; see `plan`.
         is_tentative: Whether planning gives up if the goals of its first initial guess seem to be
@@ -54,6 +56,7 @@ class PlanningRequest:
     cache: Cache = field(default_factory=Cache)
     effort: int = 1
     guess: Trajectory | None = None
+    explains: bool = True
     wants_draft: bool = False
     is_tentative: bool = False
 

@@ -57,9 +57,6 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Task
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-_CHECK_TIME = 2e-3
-"""Time per waypoint [s] that validation takes, until it was measured; rather too long."""
-
 _NEARLY_FREE = 0.02
 """Missing clearance [m] up to which a trajectory is described as nearly collision-free."""
 
@@ -174,7 +171,8 @@ class TaskSearch:
         try:
             outcome = search.run(pauses=pauses)
         except BudgetExhaustedError as end:
-            outcome = search.find_nearest() or search.make_standing(), end.status
+            nearest = search.find_nearest() if request.explains else None
+            outcome = nearest or search.make_standing(), end.status
         cache.trim()  # a chore has many problems, whose solvers grow while they are used
         build_time = cache.build_time - built
         self.statistics += PlanningStatistics(
@@ -386,7 +384,8 @@ class _Search:
         problem = TrajectoryProblem(
             self.scene, task, request.options, request.terms, cache=request.cache
         )
-        reserve_time("validation", _CHECK_TIME * problem.segments, default=True)
+        check_time = request.cache.check_time * problem.segments
+        reserve_time("validation", check_time, default=True)
         return problem
 
     def _solve_from(self, problem: TrajectoryProblem, guess: InitialGuess) -> Solution:
@@ -416,6 +415,8 @@ class _Search:
         for key, value in solution.timings.items():
             self.times[key] += value
         self.history += [dataclasses.asdict(row) for row in solution.history]
+        if not (solution.converged or self.request.explains):
+            return None
         if solution.shortfall:
             if self._infeasible is None or solution.shortfall < self._infeasible[1].shortfall:
                 self._infeasible = (problem, solution, name)
@@ -445,6 +446,8 @@ class _Search:
         self, problem: TrajectoryProblem, goals: list[BlockedGoal]
     ) -> tuple[_Candidate, PlanStatus]:
         """Return the best candidate and the status of a failure, with notes on its causes."""
+        if not self.request.explains:
+            return self._best or self.make_standing(), "not converged"
         is_search = self._guess is None
         if is_search and self._find_proofs(problem):
             best = self._make_stationary(problem)
@@ -547,7 +550,7 @@ class _Search:
         with suspend_budget():
             waypoints = make_trajectory(problem, solution.z, solution.dt)
         if self.request.wants_draft and solution.converged and is_optimized:
-            self.check_time = _CHECK_TIME * problem.segments
+            self.check_time = self.request.cache.check_time * problem.segments
             return _Candidate(
                 name, problem, solution.z, waypoints, Report(), "success", is_draft=True
             )
@@ -576,6 +579,7 @@ class _Search:
         request.progress.set_activity("checking")
         report = validate(self.scene, self.task.steps, trajectory, request.options, request.terms)
         self.check_time = time.perf_counter() - began
+        request.cache.check_time = self.check_time / len(trajectory.times)
         reserve_time("validation", self.check_time)
         self.times["validation"] += self.check_time
         return report

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -16,11 +17,12 @@ from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import find_phase_at
 
-_TICK = 2e-3  # [s] between knots of the braking motion
+_STEP = 5e-3  # [s] of the motion's time between knots of the braking motion
 # Share of the acceleration limits that is used: between knots, a cubic may exceed what it has
-# there by a few per cent.
-_SHARE = 0.9
+# there a little.
+_SHARE = 0.97
 _SLOW = 1e-9  # [m/s] or [rad/s] below which a coordinate does not bound the braking
+_REST = 2e-3  # [s], duration of a stop of a motion that rests already
 
 
 def brake(scene: Scene, motion: Trajectory, time: float, options: Options) -> Trajectory:
@@ -28,10 +30,11 @@ def brake(scene: Scene, motion: Trajectory, time: float, options: Options) -> Tr
 
     The motion q(τ) is run through by a clock τ(t) whose rate r = dτ/dt falls from 1 to 0:
 
-        dq/dt = r q'(τ),    d²q/dt² = r² q''(τ) + r' q'(τ)
+        dq/dt = r q'(τ),    d²q/dt² = r² q''(τ) + u q'(τ),    u = d²τ/dt² = ½ d(r²)/dτ
 
-    At every tick, r' is the least value at which no coordinate exceeds its acceleration limit. As
-    the motion keeps its limits at r = 1, r' = 0 does at r ≤ 1, so that there always is one.
+    From one knot to the next, u is constant. It is the least value at which no coordinate exceeds
+    its acceleration limit at either. As the motion keeps its limits at r = 1, u = 0 does at every
+    r ≤ 1, so that there always is one.
 
     Args:
         scene: Scene of the motion.
@@ -42,39 +45,73 @@ def brake(scene: Scene, motion: Trajectory, time: float, options: Options) -> Tr
     Returns:
         The motion from `time` on, which counts from 0.
     """
-    acceleration = _SHARE * Limits.from_scene(scene, motion.names, options.jerk_time).acceleration
-    clocks = [float(time)]
-    rates = [1.0]
-    while rates[-1] > 0.0:
-        clock, rate = clocks[-1], rates[-1]
-        velocity = motion.velocity(clock)
-        curvature = rate**2 * motion.acceleration(clock)
-        slowing = _find_strongest_braking(velocity, curvature, acceleration)
-        next_rate = max(rate + _TICK * slowing, 0.0)
-        clocks.append(min(clock + _TICK * (rate + next_rate) / 2.0, float(motion.times[-1])))
-        rates.append(next_rate)
-    return _run_through(motion, np.array(clocks), np.array(rates))
+    limits = Limits.from_scene(scene, motion.names, options.jerk_time)
+    limit = _SHARE * limits.acceleration
+    clocks = [time]
+    squares = [1.0]  # of the rate r
+    for first, last in itertools.pairwise(_choose_places(motion, time)):
+        braking = _find_strongest_braking(motion, first, last, squares[-1], limit)
+        square = squares[-1] + 2.0 * braking * (last - first)
+        if square <= 0.0:
+            clocks.append(first + min(-squares[-1] / (2.0 * braking), last - first))
+            squares.append(0.0)
+            break
+        clocks.append(last)
+        squares.append(square)
+    return _run_through(motion, np.array(clocks), np.sqrt(squares))
 
 
-def _find_strongest_braking(velocity: Floats, curvature: Floats, limit: Floats) -> float:
-    """Return the least r' ≤ 0 with |r² q'' + r' q'| ≤ limit.
+def _choose_places(motion: Trajectory, time: float) -> Floats:
+    """Return times of a motion from `time` to its end, with all its knots among them."""
+    end = float(motion.times[-1])
+    every = np.arange(time, end, _STEP)
+    knots = motion.times if motion.curve is None else motion.curve.times
+    places = np.union1d(every, knots[(knots > time) & (knots <= end)])
+    is_apart = np.diff(places, prepend=-np.inf) > _SLOW
+    return np.asarray(places[is_apart])
+
+
+def _find_strongest_braking(
+    motion: Trajectory, first: float, last: float, square: float, limit: Floats
+) -> float:
+    """Return the least u ≤ 0 with |r² q'' + u q'| ≤ limit at both ends of a part of a motion.
+
+    At the end, r² has become `square` + 2 u (last - first), so that this is linear in u there, too.
 
     Args:
-        velocity: q', shape (n,).
-        curvature: r² q'', shape (n,).
+        motion: The motion.
+        first: Begin of the part [s].
+        last: End of the part [s]; there is no knot in between.
+        square: r² at its begin.
         limit: Largest accelerations, shape (n,).
     """
-    moves = (np.abs(velocity) > _SLOW) & np.isfinite(limit)
-    speed = np.abs(velocity[moves])
-    # Along the direction of its motion, a coordinate has r² q'' sign(q') + r' |q'|.
-    along = curvature[moves] * np.sign(velocity[moves])
-    bounds = -(limit[moves] + along) / speed
-    return float(min(bounds.max(initial=-np.inf), 0.0))
+    middle = (first + last) / 2.0
+    duration = last - first
+    # The acceleration of a cubic is linear, and jumps at knots.
+    at_middle = motion.acceleration(middle)
+    slope = (motion.acceleration(first + duration / 4.0) - at_middle) * -4.0 / duration
+    begin = at_middle - slope * duration / 2.0
+    end = at_middle + slope * duration / 2.0
+    factors = np.concatenate([motion.velocity(first), motion.velocity(last) + 2 * duration * end])
+    offsets = square * np.concatenate([begin, end])
+    both_limits = np.concatenate([limit, limit])
+    bounds_u = (np.abs(factors) > _SLOW) & np.isfinite(both_limits)
+    # Where the factor f is positive, u ≥ -(limit + offset) / f, else u ≥ (limit - offset) / f.
+    along = offsets[bounds_u] * np.sign(factors[bounds_u])
+    lowest = -(both_limits[bounds_u] + along) / np.abs(factors[bounds_u])
+    return float(min(lowest.max(initial=-np.inf), 0.0))
 
 
 def _run_through(motion: Trajectory, clocks: Floats, rates: Floats) -> Trajectory:
-    """Return a motion that is at q(clocks) after every tick, with the velocities rates·q'."""
-    times = _TICK * np.arange(len(clocks), dtype=float)
+    """Return a motion that has the given clocks τ and rates r at its knots."""
+    is_resting = len(clocks) == 1 or not motion.velocity(clocks[0]).any()
+    if is_resting:
+        clocks = np.repeat(clocks[:1], 2)
+        rates = np.zeros(2)
+        durations = np.array([_REST])
+    else:
+        durations = 2.0 * np.diff(clocks) / (rates[1:] + rates[:-1])
+    times = np.concatenate([[0.0], np.cumsum(durations)])
     positions = motion.at(clocks)
     curve = Curve(times, positions, rates[:, None] * motion.velocity(clocks))
     spans = _split_into_phases(motion, clocks)

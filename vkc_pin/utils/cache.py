@@ -13,6 +13,8 @@ from vkc_pin.utils.system import release_freed_memory
 
 T = TypeVar("T")
 
+_FIRST_CHECK_TIME = 2e-3  # [s]
+
 
 @dataclass(frozen=True)
 class CacheInfo:
@@ -43,12 +45,15 @@ class Cache:
 
     Attributes:
         build_time: Time spent on building so far [s].
+        check_time: Time that the last validation took per waypoint [s], which tells how much time
+            to reserve for the next; at first rather too much.
     """
 
     def __init__(self, *, max_entries: int = 512, max_nbytes: float = 2.0**30) -> None:
         self.max_entries = max_entries
         self.max_nbytes = max_nbytes
         self.build_time = 0.0
+        self.check_time = _FIRST_CHECK_TIME
         self._objects: OrderedDict[Hashable, Any] = OrderedDict()
         self._hits = 0
         self._misses = 0

@@ -15,6 +15,7 @@ from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner
 from vkc_pin.planning.prepare import prepare
 from vkc_pin.planning.replan import find_remaining_steps, replan
+from vkc_pin.planning.stopping import brake
 from vkc_pin.utils.arguments import check_instance, check_number
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Step
@@ -27,7 +28,6 @@ Decision = Literal["go on", "replan", "brake", "wait", "stop"]
 """What a cycle did: nothing; sent a new motion; braked on the path; stood still, since no motion
 was found yet; or gave up."""
 
-_DISTANCES = ("clearance", "penetration")
 _BRAKE_DELAY = 0.02  # [s] from the decision to brake to its begin, for sending the motion
 
 
@@ -172,9 +172,9 @@ class _Loop:
             self._robot.wait(next_cycle)
             state = self._robot.read()
             began = time.perf_counter()
+            motion_time = self._get_motion_time(state.time)
             decision, why = self._decide(state)
             latency = time.perf_counter() - began
-            motion_time = self._get_motion_time(state.time)
             self._cycles.append(Cycle(state.time, motion_time, latency, decision, why))
             self._late += latency > self._period
             if decision == "stop":
@@ -211,13 +211,13 @@ class _Loop:
 
     def _decide(self, state: RobotState) -> tuple[Decision, str]:
         begin, plan = self._sent[-1]
+        if self._waiting is not None:
+            return self._plan_from_rest(state, self._waiting)
         if state.time < begin:
             return "go on", ""  # a motion has been sent that has not begun
         now = self._get_motion_time(state.time)
         scene = None if self._observe is None else self._look(plan.scene)
         finding = self._monitor.check(now, state, scene)
-        if self._waiting is not None:
-            return self._plan_from_rest(state, self._waiting)
         if not finding.reason:
             return "go on", ""
         return self._react(state, now, finding)
@@ -250,17 +250,13 @@ class _Loop:
             steps = find_remaining_steps(plan, motion_time)
         except InputError:
             return "stop", reason
-        stop = plan.stop(motion_time, scene=self._look(plan.scene_at(motion_time)))
-        # If something will be touched all the same, nothing is better than to brake.
-        others = [one for one in stop.report.violations if one.constraint not in _DISTANCES]
-        if others:
-            self._robot.stop()
-            return "stop", f"{reason}; braking fails: {others[0].text}"
+        # Whatever will be touched, nothing is better than to brake: it is sent unchecked.
+        motion = brake(plan.scene, plan.trajectory, motion_time, plan.options)
+        self._robot.send(motion, clock)
         self._waiting = (steps, plan.trajectory)
-        self._robot.send(stop.trajectory, clock)
+        stop = plan.stop(motion_time, scene=self._look(plan.scene_at(motion_time)))
         self._sent.append((clock, stop))
-        self._monitor = Monitor(stop, tracking=self._tracking)
-        self._rest_since = clock + float(stop.trajectory.times[-1])
+        self._rest_since = clock + float(motion.times[-1])
         return "brake", reason
 
     def _plan_from_rest(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -47,17 +46,24 @@ def brake(scene: Scene, motion: Trajectory, time: float, options: Options) -> Tr
     """
     limits = Limits.from_scene(scene, motion.names, options.jerk_time)
     limit = _SHARE * limits.acceleration
+    places = _choose_places(motion, time)
+    velocity = motion.velocity(places)
+    begin, end = _compute_accelerations(motion, places)
     clocks = [time]
     squares = [1.0]  # of the rate r
-    for first, last in itertools.pairwise(_choose_places(motion, time)):
-        braking = _find_strongest_braking(motion, first, last, squares[-1], limit)
-        square = squares[-1] + 2.0 * braking * (last - first)
-        if square <= 0.0:
-            clocks.append(first + min(-squares[-1] / (2.0 * braking), last - first))
+    for k, duration in enumerate(np.diff(places).tolist()):
+        square = squares[-1]
+        # At the end of the part, r² has become square + 2 u duration: linear in u there, too.
+        factors = np.concatenate([velocity[k], velocity[k + 1] + 2.0 * duration * end[k]])
+        offsets = square * np.concatenate([begin[k], end[k]])
+        braking = _find_least(factors, offsets, np.concatenate([limit, limit]))
+        next_square = square + 2.0 * braking * duration
+        if next_square <= 0.0:
+            clocks.append(float(places[k]) - square / (2.0 * braking))
             squares.append(0.0)
             break
-        clocks.append(last)
-        squares.append(square)
+        clocks.append(float(places[k + 1]))
+        squares.append(next_square)
     return _run_through(motion, np.array(clocks), np.sqrt(squares))
 
 
@@ -71,34 +77,24 @@ def _choose_places(motion: Trajectory, time: float) -> Floats:
     return np.asarray(places[is_apart])
 
 
-def _find_strongest_braking(
-    motion: Trajectory, first: float, last: float, square: float, limit: Floats
-) -> float:
-    """Return the least u ≤ 0 with |r² q'' + u q'| ≤ limit at both ends of a part of a motion.
+def _compute_accelerations(motion: Trajectory, places: Floats) -> tuple[Floats, Floats]:
+    """Return the accelerations at begin and end of the parts between places, (K − 1, n) each.
 
-    At the end, r² has become `square` + 2 u (last - first), so that this is linear in u there, too.
-
-    Args:
-        motion: The motion.
-        first: Begin of the part [s].
-        last: End of the part [s]; there is no knot in between.
-        square: r² at its begin.
-        limit: Largest accelerations, shape (n,).
+    In a part without knots inside, the acceleration of a cubic is linear. It jumps at knots.
     """
-    middle = (first + last) / 2.0
-    duration = last - first
-    # The acceleration of a cubic is linear, and jumps at knots.
-    at_middle = motion.acceleration(middle)
-    slope = (motion.acceleration(first + duration / 4.0) - at_middle) * -4.0 / duration
-    begin = at_middle - slope * duration / 2.0
-    end = at_middle + slope * duration / 2.0
-    factors = np.concatenate([motion.velocity(first), motion.velocity(last) + 2 * duration * end])
-    offsets = square * np.concatenate([begin, end])
-    both_limits = np.concatenate([limit, limit])
-    bounds_u = (np.abs(factors) > _SLOW) & np.isfinite(both_limits)
-    # Where the factor f is positive, u ≥ -(limit + offset) / f, else u ≥ (limit - offset) / f.
-    along = offsets[bounds_u] * np.sign(factors[bounds_u])
-    lowest = -(both_limits[bounds_u] + along) / np.abs(factors[bounds_u])
+    durations = np.diff(places)
+    at_middle = motion.acceleration(places[:-1] + durations / 2.0)
+    at_quarter = motion.acceleration(places[:-1] + durations / 4.0)
+    change = 2.0 * (at_middle - at_quarter)
+    return at_middle - change, at_middle + change
+
+
+def _find_least(factors: Floats, offsets: Floats, limits: Floats) -> float:
+    """Return the least u ≤ 0 with |factor·u + offset| ≤ limit for all of m rows, shape (m,)."""
+    counts = (np.abs(factors) > _SLOW) & np.isfinite(limits)
+    # Where the factor is positive, u ≥ -(limit + offset)/factor, else u ≥ (limit - offset)/factor.
+    along = offsets[counts] * np.sign(factors[counts])
+    lowest = -(limits[counts] + along) / np.abs(factors[counts])
     return float(min(lowest.max(initial=-np.inf), 0.0))
 
 

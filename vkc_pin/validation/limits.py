@@ -132,7 +132,7 @@ def check_rates(samples: Samples, options: Options) -> Iterator[Violation]:
         end_errors = np.nan_to_num(np.abs(end_errors))
         velocities, accelerations = curve.compute_max_rates()
         if options.jerk_time > 0.0:
-            jerks = curve.compute_jerks()
+            jerks = curve.compute_jerks(samples.start_acceleration)
     for i, name in enumerate(motion.names):
         _, _, max_speed, max_acceleration = samples.get_limits(name)
         checks = [

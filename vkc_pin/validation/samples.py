@@ -296,6 +296,18 @@ class Samples:
                 velocity[k] = np.nan
         return velocity
 
+    @cached_property
+    def start_acceleration(self) -> Floats:
+        """Acceleration of the trajectory's coordinates before the start, shape (n,).
+
+        Only that of a base on wheels is not zero, which follows an arc: θ̇ (−ẏ, ẋ).
+        """
+        acceleration = np.zeros(len(self.trajectory.names))
+        if self.scene.robot.base in ("differential", "ackermann"):
+            vx, vy, turn = self.scene.start_velocity[:3]
+            acceleration[:2] = (-turn * vy, turn * vx)
+        return acceleration
+
     def estimate_start_velocity(self) -> Floats:
         """Return `start_velocity`, with the first segment's mean velocity where that is unknown."""
         is_known = ~np.isnan(self.start_velocity)

@@ -74,3 +74,43 @@ def test_runs_are_stretched_as_needed_up_to_a_limit(seed: int, size: float) -> N
     if (longer.dt < 1.5 * dt).all():
         assert longer.compute_violation(first, second) <= 0.0
     np.testing.assert_array_equal(timing.dt, dt)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_stretched_steps_keep_the_velocities_at_the_ends(seed: int) -> None:
+    """Any factor from the returned one on keeps all bounds; a smaller one does not."""
+    rng = np.random.default_rng(seed)
+    path = np.cumsum(rng.uniform(-0.3, 0.3, (5, 2)), axis=0)
+    velocities = rng.uniform(-0.5, 0.5, (2, 2))
+    steps = np.diff(path, axis=0)
+
+    def compute_excess(dt: float) -> float:
+        timing = make_timing(dt)
+        outer = np.vstack([velocities[0] * dt, steps, velocities[1] * dt])
+        return timing.compute_violation(steps, np.diff(outer, axis=0))
+
+    def make_timing(dt: float) -> Timing:
+        limits = (np.full(2, 1e3), np.full(2, 2.0))
+        return Timing(np.full(4, dt), np.full(4, 10.0), [(0, 4)], limits, velocities)
+
+    outer = np.vstack([velocities[0] * 0.02, steps, velocities[1] * 0.02])
+    stretched = make_timing(0.02).stretch(steps, np.diff(outer, axis=0)).dt[0] / 1.001
+    for factor in (1.0, 1.1, 2.0, 8.0):
+        assert compute_excess(factor * stretched) <= 1e-9
+    if stretched > 0.021:
+        assert compute_excess(0.999 * stretched) > 0.0
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_cubic_with_velocities_at_its_ends_keeps_the_limits(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    path = np.cumsum(0.1 * rng.uniform(-1.0, 1.0, (2, 3)), axis=0)
+    limits = (np.full(3, 1e3), rng.uniform(0.5, 4.0, 3))
+    begin, end = velocities = rng.uniform(-1.0, 1.0, (2, 3))
+    (T,) = compute_step_times(path, 1e-3, [(0, 1)], limits, end_velocities=velocities)
+    change = path[1] - path[0]
+    strongest = [6.0 * change / T**2 - (4.0 * begin + 2.0 * end) / T]
+    strongest.append(-6.0 * change / T**2 + (2.0 * begin + 4.0 * end) / T)
+    assert (np.abs(strongest) <= limits[1]).all()

@@ -122,3 +122,45 @@ def test_tiny_step_costs_no_more_than_a_stop(gap: float, jerk_time: float) -> No
     assert motion.times[-1] <= once.times[-1] + 2.0 + 2.0 * jerk_time
     limits = Limits.from_scene(SCENE, motion.names, jerk_time)
     assert limits.compute_slowdown(motion.curve) <= 1.0 + 1e-6  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("jerk_time", [0.0, 0.1])
+@pytest.mark.parametrize("seed", range(4))
+def test_motion_has_the_given_velocities_at_its_ends(seed: int, jerk_time: float) -> None:
+    slow = sample_trajectory(seed)
+    robot = SCENE.robot
+    velocities = np.random.default_rng(seed).uniform(-0.2, 0.2, (2, len(slow.names)))
+    motion = retime_trajectory(SCENE, slow, jerk_time=jerk_time, end_velocities=velocities)
+    np.testing.assert_array_equal(motion.positions, slow.positions)
+    assert motion.curve is not None
+    np.testing.assert_allclose(motion.curve.rates[[0, -1]], velocities, atol=1e-12)
+    speeds, accelerations = motion.curve.compute_max_rates()
+    assert (speeds <= robot.velocity * (1.0 + 1e-6)).all()
+    assert (accelerations <= robot.acceleration * (1.0 + 1e-6)).all()
+    if jerk_time:
+        jerks, jumps = motion.curve.compute_jerks()
+        assert (jerks <= robot.acceleration / jerk_time * (1.0 + 1e-6)).all()
+        assert (jumps < 1e-4 * robot.acceleration).all()
+
+
+def test_moving_start_along_the_path_needs_no_stop() -> None:
+    """A motion that continues one of constant velocity does not brake first."""
+    start = np.asarray(SCENE.start)
+    velocity = np.zeros((2, len(start)))
+    velocity[:, 0] = 0.5
+    rows = start + np.outer(np.linspace(0.0, 1.0, 9), np.eye(len(start))[0])
+    phases = (vkc.PhaseSpan("go", 0, 8),)
+    slow = Trajectory(SCENE.robot.coordinates.names, np.arange(9.0), rows, phases, len(start))
+    motion = retime_trajectory(SCENE, slow, end_velocities=velocity)
+    assert motion.velocity(np.linspace(0.0, motion.times[-1], 100))[:, 0].min() > 0.49
+
+
+def test_moving_start_of_a_stationary_trajectory_brakes_and_returns() -> None:
+    still = sample_trajectory()
+    still = dataclasses.replace(still, positions=np.tile(still.positions[:1], (13, 1)))
+    velocities = np.zeros((2, len(still.names)))
+    velocities[0, 0] = 0.3
+    motion = retime_trajectory(SCENE, still, end_velocities=velocities)
+    np.testing.assert_allclose(motion.velocity(0.0), velocities[0], atol=1e-12)
+    reach = motion(np.linspace(0.0, 1.0, 400))[:, 0].max() - still.positions[0, 0]
+    assert reach == pytest.approx(0.3**2 / 2.0 / SCENE.robot.acceleration[0], rel=1e-2)

@@ -13,6 +13,7 @@ _LONGER = 1.1  # factor of the duration of an arc whose accelerations exceed the
 _MAX_LONGER = 20  # times that it is applied
 _CUBICS_OF_ARC = 16  # so that cubics between their ends roll, too
 _MIN_DURATION = 1e-3  # [s]
+_ROUNDING = 1e-8  # relative
 
 
 def make_braking_curve(
@@ -51,7 +52,7 @@ def make_braking_curve(
         return Curve(times, positions, np.outer(shares, velocity))
     curve = _brake_along_arc(position, velocity, duration, limits)
     for _ in range(_MAX_LONGER):
-        if limits.compute_slowdown(curve) < _LONGER:
+        if limits.compute_slowdown(curve) <= 1.0 + _ROUNDING:
             break
         duration *= _LONGER
         curve = _brake_along_arc(position, velocity, duration, limits)

@@ -170,15 +170,17 @@ class Curve:
         end = 6.0 / h**2 * ((q - d) - (d - c))
         return begin, end
 
-    def compute_jerks(self) -> tuple[Floats, Floats]:
+    def compute_jerks(self, start_acceleration: Floats | None = None) -> tuple[Floats, Floats]:
         """Compute |jerk| of each cubic, shape (K − 1, n), and acceleration jumps at knots, (K, n).
 
-        Before the first and after the last knot there is no acceleration.
+        Before the first knot there is a given acceleration, shape (n,), by default none, and after
+        the last one none.
         """
         h = np.diff(self.times)[:, None]
         begin, end = self.compute_accelerations()
         none = np.zeros((1, self.positions.shape[1]))
-        jumps = np.concatenate([begin, none]) - np.concatenate([none, end])
+        before = none if start_acceleration is None else start_acceleration[None]
+        jumps = np.concatenate([begin, none]) - np.concatenate([before, end])
         return np.abs(end - begin) / h, np.abs(jumps)
 
     def part(self, begin: float, end: float, columns: Sequence[int] | slice = slice(None)) -> Curve:

@@ -25,7 +25,8 @@ from helpers.expected_errors import expect_error
 
 import vkc_pin as vkc
 from vkc_pin import Options, Scene, Trajectory, Violation, validate
-from vkc_pin.validation.remaining import RemainingCheck
+from vkc_pin.validation import RemainingCheck
+from vkc_pin.validation.samples import Samples
 from vkc_pin.world.collision.distances import count_distance_queries
 from vkc_pin.world.task.steps import Step
 
@@ -95,7 +96,8 @@ def test_neighbours_of_doors_are_exempt_as_in_validation(
 ) -> None:
     plan = door_plan
     door = plan.scene.objects["door"]
-    panel = [s for s in door.object.collision.geometryObjects if s.name.startswith("panel")][0]
+    shapes = door.object.collision.geometryObjects
+    panel = next(shape for shape in shapes if shape.name.startswith("panel"))
     half = np.array(panel.geometry.halfSide)
     leaf = door.link_placement("panel") * panel.placement
     sofa = plan.scene.obstacles[plan.scene.obstacle_labels.index("sofa")]
@@ -179,7 +181,7 @@ def test_only_the_rest_of_the_motion_is_checked(crossing: tuple[Scene, Trajector
     for time in (0.0, corner, drive.times[-1] - 1e-3, drive.times[-1], 1e3):
         (worst, *_) = sorted(check.find_violations(end, time), key=lambda one: -one.amount)
         assert worst.amount > 0.2, time
-    samples = vkc.validation.samples.Samples(scene, drive).times
+    samples = Samples(scene, drive).times
     for time in np.linspace(0.0, drive.times[-1], 7).tolist():
         first = samples[np.searchsorted(samples, time, side="right") - 1]
         assert all(one.time >= first for one in check.find_violations(begin, time))

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import bisect
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
 from vkc_pin.options import Options
+from vkc_pin.utils.arrays import Bools, Ints
 from vkc_pin.validation.collisions import Hit, PairTable, sweep
 from vkc_pin.validation.contact_windows import find_contact_windows
 from vkc_pin.validation.distances import CollisionShapes
@@ -126,34 +127,43 @@ def check_clearance(
     obstacles_only = obstacles is not None
     world = samples.world if obstacles is None else obstacles
     solids = CollisionShapes(world)
-    pairs = PairTable(
+    windows = find_contact_windows(
+        samples, solids, steps, options, tolerances, obstacles_only=obstacles_only
+    )
+    table = PairTable(
         world.scene,
         solids,
         samples.trajectory,
         options.dist_safe,
         options.self_distance,
-        windows=find_contact_windows(
-            samples, solids, steps, options, tolerances, obstacles_only=obstacles_only
-        ),
+        windows=windows,
         samples=samples,
         obstacles_only=obstacles_only,
     )
+    exemptions: dict[tuple[int, int], list[ExemptPairs]] = {}
     exempt_pairs = find_exempt_pairs(
         world.scene, solids, options.dist_safe, obstacles_only=obstacles_only
     )
-    exemptions: dict[tuple[int, int], list[ExemptPairs]] = {}
     for one in exempt_pairs:
         for first, second in one.pairs.tolist():
             exemptions.setdefault((first, second), []).append(one)
+    deepest_only = None
+    if obstacles_only:
+        # Where a pair may overlap for a while, its deepest overlap need not be a violation.
+        deepest_only = ~(table.have_windows | _are_listed(table.pairs, exemptions))
     check = ClearanceCheck(samples)
     hits = sweep(
-        pairs,
+        table,
         samples.z,
         samples.waypoint_rows,
-        first=samples.find_waypoint(first_row),
-        close_only=obstacles_only,
+        first_row=first_row,
+        deepest_only=deepest_only,
     )
     for hit in hits:
-        if hit.row >= first_row:
-            check.add(hit, exemptions.get(hit.shapes, []))
+        check.add(hit, exemptions.get(hit.shapes, []))
     return check
+
+
+def _are_listed(pairs: Ints, listed: Collection[tuple[int, int]]) -> Bools:
+    """Return which pairs, shape (P, 2), are in a collection of pairs, shape (P,)."""
+    return np.array([(first, second) in listed for first, second in pairs.tolist()], bool)

@@ -83,6 +83,11 @@ class PairTable:
         self.margins[: len(own)] = own_margins
         self._windows = _WindowIndex(windows, self.pairs)
 
+    @property
+    def have_windows(self) -> Bools:
+        """Which pairs may be closer at some time, shape (P,)."""
+        return self._windows.have_any
+
     def _list_groups(self) -> list[str]:
         """Return for each shape "robot", the name of its object, or "" for an obstacle."""
         robot_size = len(self.scene.robot.collision.geometryObjects)
@@ -217,6 +222,7 @@ class _WindowIndex:
         of_pair, self._which = listed[np.lexsort((listed[:, 1], listed[:, 0]))].T
         self._count = np.bincount(of_pair, minlength=len(pairs))
         self._begin = np.cumsum(self._count) - self._count
+        self.have_any: Bools = self._count > 0
 
     @staticmethod
     def _list_windows(windows: Sequence[Window], pairs: Ints) -> Ints:
@@ -271,30 +277,43 @@ class Hit(NamedTuple):
 
 
 def sweep(
-    table: PairTable, z: Floats, waypoints: Ints, *, first: int = 0, close_only: bool = False
+    table: PairTable,
+    z: Floats,
+    waypoints: Ints,
+    *,
+    first_row: int = 0,
+    deepest_only: Bools | None = None,
 ) -> Iterator[Hit]:
     """Yield close pairs along a motion: first those at waypoints, then those between them.
 
     Args:
-        table: Pairs that could collide.
+        table: P pairs that could collide.
         z: Configurations of the world, shape (S, n), evenly spaced between waypoints.
         waypoints: Rows of `z` that are the waypoints, shape (T,).
-        first: First waypoint of the part of the motion that is searched.
-        close_only: Whether only pairs that violate their clearance, or might, are yielded.
-            Otherwise the closest pair of each waypoint is yielded, too, and the closest of all.
+        first_row: First row of `z` that is searched.
+        deepest_only: Pairs of which only the deepest overlap matters, shape (P,). If given, pairs
+            that violate no clearance are not searched. Default: the closest pair of each waypoint
+            is yielded, too, and that of the whole motion.
     """
-    return _Sweep(table, waypoints, first, close_only=close_only).find_hits(z)
+    return _Sweep(table, waypoints, first_row, deepest_only).find_hits(z)
 
 
 class _Sweep:
     """Searches a motion for close pairs, at waypoints and then between them."""
 
-    def __init__(self, table: PairTable, waypoints: Ints, first: int, *, close_only: bool) -> None:
+    def __init__(
+        self, table: PairTable, waypoints: Ints, first_row: int, deepest_only: Bools | None
+    ) -> None:
         self._table = table
         self._solids = table.solids
         self._waypoints = waypoints
-        self._first = first
-        self._close_only = close_only
+        self._first_row = first_row
+        self._close_only = deepest_only is not None
+        # Deepest overlap so far of each pair of which only that matters, as a distance [m].
+        self._deepest = np.full(len(table.pairs), np.inf)
+        self._deepest_only = np.zeros(len(table.pairs), bool)
+        if deepest_only is not None:
+            self._deepest_only = deepest_only
 
     def find_hits(self, z: Floats) -> Iterator[Hit]:
         waypoints = self._waypoints
@@ -304,6 +323,7 @@ class _Sweep:
         apart = np.flatnonzero(margins > -np.inf)  # pairs that do not move together
         closest = apart[_find_group_minima(at[apart], distances[apart])]
         is_exempt = self._table.find_exempt(pairs, at) & (distances < self._table.margins[pairs])
+        self._select_overlaps(waypoints[at], pairs, distances)
         is_close = distances < np.maximum(margins, 0.0)
         chosen = np.union1d(closest, np.flatnonzero(is_close | is_exempt))
         yield from self._make_hits(
@@ -333,14 +353,17 @@ class _Sweep:
         """Bisect intervals and yield pairs that come closer than `smallest` inside of them.
 
         Every state s in between satisfies d(s) ≥ (d_t + d_{t+1} − relative motion) / 2, so that
-        intervals with a larger bound are dropped. Without relative motion the distance is constant;
+        intervals with a larger bound are dropped, and those with a bound above the deepest overlap
+        of a pair of which only that matters. Without relative motion the distance is constant;
         only overlaps are followed then, to report all of their samples.
         """
         while len(todo.pair):
             motion = self._bound_motion(todo, moved)
-            may_be_close = todo.before + todo.after - motion < 2 * smallest
+            limit = np.minimum(smallest, self._deepest[todo.pair])
+            may_be_close = todo.before + todo.after - motion < 2 * limit
             may_change = (motion > MIN_MOTION) | (todo.before < 0)
-            todo = todo.select(may_be_close & may_change)
+            is_left = todo.high > self._first_row
+            todo = todo.select(may_be_close & may_change & is_left)
             is_adjacent = todo.high - todo.low == 1
             yield from self._find_tunnelling(z, todo.select(is_adjacent), moved)
             todo = todo.select(~is_adjacent)
@@ -348,8 +371,9 @@ class _Sweep:
             rows, at = np.unique(middle, return_inverse=True)
             pairs = self._table.pairs[todo.pair]
             distances = self._place(z[rows]).compute_distances(at, pairs)
-            overlapping = np.flatnonzero(distances < 0)
-            chosen = np.union1d(_find_group_minima(at, distances), overlapping)
+            chosen = self._select_overlaps(middle, todo.pair, distances)
+            if not self._close_only:
+                chosen = np.union1d(_find_group_minima(at, distances), chosen)
             yield from self._make_hits(middle[chosen], todo.pair[chosen], distances[chosen])
             todo = Intervals(
                 np.append(todo.low, middle),
@@ -358,6 +382,18 @@ class _Sweep:
                 np.append(todo.before, distances),
                 np.append(distances, todo.after),
             )
+
+    def _select_overlaps(self, rows: Ints, pairs: Ints, distances: Floats) -> Ints:
+        """Return the indices of overlaps that matter, of distances of pairs at rows, shape (n,).
+
+        Of some pairs only the deepest overlap matters: those that are no deeper than an earlier one
+        are left out.
+        """
+        matters = (rows >= self._first_row) & (distances < np.minimum(0.0, self._deepest[pairs]))
+        overlaps = np.flatnonzero(matters)
+        noted = overlaps[self._deepest_only[pairs[overlaps]]]
+        np.minimum.at(self._deepest, pairs[noted], distances[noted])
+        return overlaps[~(distances[overlaps] > self._deepest[pairs[overlaps]])]
 
     def _bound_motion(self, todo: Intervals, moved: Floats) -> Floats:
         """Bound the relative motion of pairs in intervals, shape (n,) [m]."""
@@ -410,9 +446,10 @@ class _Sweep:
 
         The closest pairs are left out if only close ones are searched.
         """
-        found: list[tuple[Ints, Ints, Floats]] = []
+        found = [(np.zeros(0, int), np.zeros(0, int), np.zeros(0))]
         reach = max(self._table.margins.max(), RESOLUTION)
-        todo = np.arange(self._first, len(placed))  # states whose closest pair is not known
+        # states whose closest pair is not known
+        todo = np.flatnonzero(self._waypoints >= self._first_row)
         while len(todo):
             at_rest = np.zeros((len(todo), len(self._table.groups)))
             at, pairs = self._table.find_close_pairs(placed, todo, todo, at_rest, reach)
@@ -441,7 +478,8 @@ class _Sweep:
         By the bound of `_search_intervals`, the distance at one of both ends is then less than
         `smallest` plus half the relative motion.
         """
-        begin = np.arange(self._first, len(moved))
+        first = self._find_interval(np.array([self._first_row]))[0]
+        begin = np.arange(first, len(moved))
         at, pairs = self._table.find_close_pairs(placed, begin, begin + 1, moved[begin], smallest)
         return begin[at], pairs
 

@@ -14,10 +14,12 @@ import pytest
 import yaml
 from helpers.carrying import compute_grasp_pose, describe_box
 from helpers.expected_errors import expect_error
+from helpers.meshes import write_wedge
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin import Scene, load_scene
+from vkc_pin.world.scene.clearance_exemptions import find_clearance_exemptions
 
 HALL = """\
 robot: husky_ur5e
@@ -86,6 +88,114 @@ def test_documents_and_placements_are_copies() -> None:
     assert front["yaw"] == 0.7, "the description of an unmoved object changed"
     with expect_error("did you mean 'cane'"):
         moved.with_placement("cana", placement)
+
+
+ROCKS = """\
+robot: husky_ur5e
+start: {base: [0.0, 0.0, 0.5]}
+obstacles:
+  - {name: crate, type: box, size: [0.5, 0.4, 0.3], position: [2, 2, 0.15], yaw: 0.2}
+  - {name: person, type: cylinder, radius: 0.3, length: 1.8, position: [-2, 2, 0.9]}
+  - {name: rock, type: mesh, file: wedge.obj, position: [1, 2, 0], quaternion: [0, 0, 1, 0]}
+  - {name: chest, type: urdf, file: chest.urdf, position: [-1, 2, 0], rpy: [0.1, 0.2, 0.3]}
+  - {name: chest_0, type: sphere, radius: 0.2, position: [3, 0, 1]}
+"""
+
+
+@pytest.fixture(scope="module")
+def rocks(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    """Return a scene with obstacles of several types; the chest has two shapes."""
+    folder = tmp_path_factory.mktemp("rocks")
+    write_wedge(folder / "wedge.obj")
+    (folder / "chest.urdf").write_text(
+        """<robot name="r"><link name="a"><collision><origin xyz="0 0 1"/><geometry>
+        <sphere radius="0.1"/></geometry></collision><visual><geometry><sphere radius="0.1"/>
+        </geometry></visual></link><link name="b"><collision><geometry><box size="1 2 3"/>
+        </geometry></collision><visual><geometry><sphere radius="0.1"/></geometry></visual></link>
+        <joint name="j" type="fixed"><parent link="a"/><child link="b"/>
+        <origin xyz="0.5 0 0" rpy="0 0 0.4"/></joint></robot>"""
+    )
+    (folder / "rocks.yaml").write_text(ROCKS)
+    return load_scene(folder / "rocks.yaml")
+
+
+def list_placements(scene: Scene) -> list[pin.SE3]:
+    return [shape.placement for shape in (*scene.obstacles, *scene.obstacle_visual)]
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    name=st.sampled_from(["crate", "person", "rock", "chest", "chest_0"]),
+    position=st.tuples(lengths, lengths, lengths),
+    rpy=st.tuples(angles, st.sampled_from([0.0, np.pi / 2]) | angles, angles),
+)
+def test_moved_obstacle_takes_its_shapes_along(
+    rocks: Scene, name: str, position: tuple[float, ...], rpy: tuple[float, ...]
+) -> None:
+    placement = pin.SE3(pin.rpy.rpyToMatrix(*rpy), np.array(position))
+    moved = rocks.with_obstacle(name, placement)
+    entry = {**rocks.document["obstacles"][rocks.obstacle_names.index(name)]}
+    for orientation in ("rpy", "yaw", "quaternion"):
+        entry.pop(orientation, None)
+    entry |= {"position": list(position), "rpy": list(rpy)}
+    obstacles = [entry if one["name"] == name else one for one in rocks.document["obstacles"]]
+    loaded = Scene.from_document({**rocks.document, "obstacles": obstacles}, rocks.folder)
+    for one, other in zip(list_placements(moved), list_placements(loaded), strict=True):
+        assert_close(one, other, 1e-12)
+    again = Scene.from_document(json.loads(json.dumps(moved.document)), moved.folder)
+    assert again.document == moved.document
+    for one, other in zip(list_placements(moved), list_placements(again), strict=True):
+        assert_close(one, other, 1e-15 if name != "chest" else 1e-12)
+    back = moved.with_obstacle(name, pin.SE3.Identity()).with_obstacle(name, placement)
+    for one, other in zip(list_placements(back), list_placements(moved), strict=True):
+        assert_close(one, other, 1e-12)
+
+
+def test_moved_obstacle_shares_everything_else(rocks: Scene) -> None:
+    moved = rocks.with_obstacle("chest", [0.0, 1.0, 0.5, 0.0, 0.0, 1.0])
+    assert moved.robot is rocks.robot
+    assert moved.objects is rocks.objects
+    assert moved.obstacle_labels == rocks.obstacle_labels
+    for one, other, label in zip(
+        moved.obstacles, rocks.obstacles, rocks.obstacle_labels, strict=True
+    ):
+        assert one.geometry == other.geometry
+        assert one.name == other.name
+        assert (one is other) == (label != "chest")
+    # Another obstacle has the name of one of its shapes.
+    labels = zip(moved.obstacle_visual, rocks.obstacle_visual, strict=True)
+    shared = [one is other for one, other in labels]
+    assert shared == [True, True, True, False, False, True]
+    assert rocks.document["obstacles"][3]["rpy"] == [0.1, 0.2, 0.3], "the scene itself changed"
+
+
+def test_exemptions_follow_moved_obstacles() -> None:
+    crate = describe_box("crate", [0.3, 0.3, 0.3], [-3.0, 0.0, 0.15])
+    scene = Scene.from_document({**make_hall().document, "obstacles": [crate]})
+    panel = scene.objects["front"].link_placement("panel")
+    near = scene.with_obstacle("crate", panel * pin.SE3(np.eye(3), np.array([0.18, 0.0, 0.0])))
+    for one in (scene, near, scene):
+        pairs = find_clearance_exemptions(one, 0.2)
+        assert any("crate" in (pair.first, pair.second) for pair in pairs) == (one is near)
+
+
+def test_invalid_moves_of_obstacles_are_refused(rocks: Scene) -> None:
+    with expect_error("did you mean 'person'", nearest="person"):
+        rocks.with_obstacle("persom", pin.SE3.Identity())
+    for name in ("floor", "chest_1"):
+        with expect_error(f"there is no obstacle '{name}'"):
+            rocks.with_obstacle(name, pin.SE3.Identity())
+    with expect_error(field="name"):
+        rocks.with_obstacle(3, pin.SE3.Identity())  # type: ignore[arg-type]
+    broken = pin.SE3.Identity()
+    broken.translation = np.array([0.0, np.nan, 0.0])
+    scaled = np.diag([2.0, 2.0, 2.0, 1.0])
+    for placement in (broken, scaled, np.full(6, np.inf), [1.0, 2.0, 3.0], [1e9] * 6, "here", None):
+        with expect_error(field="placement"):
+            rocks.with_obstacle("person", placement)
+    twice = {**rocks.document, "obstacles": [rocks.document["obstacles"][0]] * 2}
+    with expect_error("already used"):
+        Scene.from_document(twice, rocks.folder)
 
 
 @pytest.mark.parametrize("values", [(0.0, 0.0), (0.05, -0.4), (-0.095, 1.2)])

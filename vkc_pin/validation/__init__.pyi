@@ -1,0 +1,3 @@
+from .remaining import RemainingCheck
+
+__all__ = ["RemainingCheck"]

@@ -107,12 +107,8 @@ class IdealRobot:
 
     def stop(self) -> None:
         """Stay where it is."""
-        state = self.read()
-        names = self._motions[-1][1].names[: len(state.positions)] if self._motions else ()
-        self._motions = [(begin, motion) for begin, motion in self._motions if begin < state.time]
-        if names:
-            self._start = state.positions
-            self._motions = []
+        self._start = self.read().positions
+        self._motions = []
 
     def wait(self, until: float) -> None:
         """Return at a time."""

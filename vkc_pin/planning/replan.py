@@ -95,28 +95,33 @@ def _check_scene(plan: Plan, scene: Scene) -> Scene:
 def find_remaining_steps(plan: Plan, time: float) -> tuple[Step, ...]:
     """Return the steps that are not over at a time of a plan's motion [s].
 
-    A step is over when the phase after its last one has begun. Phases of steps and of the motion
-    are matched by their names.
+    A step is over at the end of its last phase, and one without phases, such as a release, when the
+    phase after it has begun. Phases of steps and of the motion are matched by their names.
 
     Raises:
         InputError: All steps are over.
     """
-    phases = plan.trajectory.phases
-    current = phases.index(find_phase_at(plan.trajectory, time))
-    ends = list[int]()  # for each step, the number of phases until its end
-    end = 0
+    motion = plan.trajectory
+    if time >= motion.times[-1]:
+        problem, expected = "all steps are over then", "a time before the end of the motion"
+        raise InputError(problem, field="time", expected=expected, got=time)
+    phases = motion.phases
+    current = phases.index(find_phase_at(motion, time))
+    done = 0
+    end = 0  # number of the motion's phases until the end of a step
     for task in compile_each_step(plan.scene, plan.steps, plan.options):
         first = 0
         for boundary in task.boundaries:
+            begin = end
             for phase in task.phases[first : boundary.phases]:
                 names = [span.name for span in phases[end:]]
                 if phase.name in names:
                     end += names.index(phase.name) + 1
             first = boundary.phases
-            ends.append(end)
-    ends[-1] = len(phases)
-    done = sum(end <= current for end in ends)
-    if time >= plan.trajectory.times[-1]:
-        problem, expected = "all steps are over then", "a time before the end of the motion"
-        raise InputError(problem, field="time", expected=expected, got=time)
-    return plan.steps[done:]
+            is_over = end <= current
+            if end > begin:
+                is_over = time >= motion.times[phases[end - 1].last]
+            if not is_over:
+                return plan.steps[done:]
+            done += 1
+    return plan.steps[-1:]

@@ -1,0 +1,216 @@
+"""Tests the closed loop with a robot that follows motions exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import vkc_pin as vkc
+from vkc_pin.errors import InputError
+from vkc_pin.execution import ExecutionResult, IdealRobot, RobotState, execute
+from vkc_pin.world.trajectory.trajectory import Trajectory
+
+LEAD = 1.0  # [s], so that slow machines find a motion in time, too
+SIZE = 9
+
+
+@cache
+def plan_door() -> vkc.Plan:
+    plan = vkc.plan(vkc.load_scene("door"), [vkc.Actuate("door", {"hinge": 1.2})])
+    assert plan.success, plan.summary()
+    return plan
+
+
+def run(
+    observe: Callable[[vkc.Scene, float], vkc.Scene] | None = None, **options: Any
+) -> tuple[ExecutionResult, IdealRobot]:
+    """Execute the door's plan; `observe` gets a scene and the robot's time."""
+    plan = plan_door()
+    robot = IdealRobot(plan.scene, is_simulated=True)
+    look = None if observe is None else lambda scene: observe(scene, robot.time)
+    result = execute(plan, robot, observe=look, **{"lead": LEAD, **options})
+    return result, robot
+
+
+def sample_motion(robot: IdealRobot, end: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return times and positions of what the robot did."""
+    times = np.arange(0.0, end, 1e-3)
+    return times, np.array([robot.compute_state(time).positions for time in times])
+
+
+def check_smooth(robot: IdealRobot, result: ExecutionResult) -> None:
+    """Check that a robot's motion has neither jumps of position nor of velocity."""
+    times, positions = sample_motion(robot, result.cycles[-1].time)
+    velocities = np.diff(positions, axis=0) / np.diff(times)[:, None]
+    limits = plan_door().scene.robot
+    assert (np.abs(velocities) <= 1.01 * limits.velocity).all()
+    accelerations = np.diff(velocities, axis=0) / 1e-3
+    assert (np.abs(accelerations) <= 1.2 * limits.acceleration + 0.05).all()
+
+
+def test_undisturbed_plan_is_executed_as_it_is() -> None:
+    result, robot = run(lambda scene, _: scene)
+    assert result.success, result
+    assert result.count_decisions() == {"go on": len(result.cycles)}
+    ((begin, motion),) = robot.motions
+    assert motion is plan_door().trajectory
+    period = np.diff([cycle.time for cycle in result.cycles])
+    np.testing.assert_allclose(period, 0.05, atol=1e-9)
+    assert result.cycles[-1].time == pytest.approx(begin + motion.times[-1], abs=0.05)
+
+
+def test_door_that_turns_out_to_be_elsewhere_is_opened() -> None:
+    at = plan_door().scene.objects["door"].placement
+    shift = np.array([0.02, 0.03, 0.0])
+    moved = pin.SE3(at.rotation @ pin.utils.rotate("z", 0.05), at.translation + shift)
+
+    def observe(scene: vkc.Scene, time: float) -> vkc.Scene:
+        return scene.with_placement("door", moved) if time > 1.0 else scene
+
+    result, robot = run(observe)
+    assert result.success, result
+    assert result.count_decisions()["replan"] >= 1
+    first = next(cycle for cycle in result.cycles if cycle.decision == "replan")
+    assert first.reason == "door is elsewhere"
+    assert first.time == pytest.approx(1.0, abs=0.06)
+    last = result.plans[-1][1]
+    assert last.scene.objects["door"].placement == moved
+    assert last.trajectory.column("door.hinge")[-1] == pytest.approx(1.2, abs=1e-3)
+    check_smooth(robot, result)
+
+
+def test_robot_goes_round_what_appears_on_its_path() -> None:
+    x, y = plan_door().trajectory.at(2.0)[:2]
+    pose = [x, y + 0.55, 0.3, 0.0, 0.0, 0.0]
+
+    def observe(scene: vkc.Scene, time: float) -> vkc.Scene:
+        return scene.with_obstacle("stool", pose) if time > 0.3 else scene
+
+    result, robot = run(observe)
+    assert result.success, result
+    assert "stool" in next(cycle.reason for cycle in result.cycles if cycle.reason)
+    _, last = result.plans[-1]
+    there = last.scene.with_obstacle("stool", pose)
+    assert vkc.validate(there, last.steps, last.trajectory, last.options).ok
+    check_smooth(robot, result)
+
+
+def test_robot_brakes_before_a_wall_and_gives_up() -> None:
+    """Something blocks the door for good: the robot stops before it, and execution fails."""
+    at = plan_door().scene.objects["door"].placement.translation
+
+    def observe(scene: vkc.Scene, time: float) -> vkc.Scene:
+        pose = [at[0] - 0.4, at[1] - 0.5, 0.25, 0.0, 0.0, 0.0]
+        return scene.with_obstacle("sofa", pose) if time > 1.0 else scene
+
+    result, robot = run(observe, patience=1.0, lead=0.3)
+    assert not result.success
+    assert "no motion was found from rest" in result.reason
+    decisions = result.count_decisions()
+    assert decisions["brake"] == 1
+    state = robot.read()
+    np.testing.assert_allclose(state.velocities, 0.0, atol=1e-9)
+    check_smooth(robot, result)
+
+
+def test_robot_off_its_motion_is_brought_back() -> None:
+    class Drifting(IdealRobot):
+        """A robot that is 50 mm off for a while, by its own measurement."""
+
+        def read(self) -> RobotState:
+            state = super().read()
+            if 1.0 < state.time < 1.2:
+                state.positions[0] += 0.05
+            return state
+
+    plan = plan_door()
+    robot = Drifting(plan.scene, is_simulated=True)
+    result = execute(plan, robot, lead=LEAD)
+    assert result.success, result
+    reasons = [cycle.reason for cycle in result.cycles if cycle.decision == "replan"]
+    assert any("base_x is 0.05 m off" in reason for reason in reasons)
+
+
+def test_robot_must_stand_at_the_start_of_the_plan() -> None:
+    plan = plan_door()
+    elsewhere = plan.scene.with_start(base=(0.0, 0.0, 0.0))
+    with pytest.raises(InputError, match="not at its start"):
+        execute(plan, IdealRobot(elsewhere, is_simulated=True))
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        ({"rate": 0.0}, "rate"),
+        ({"rate": np.nan}, "rate"),
+        ({"lead": 0.0}, "lead"),
+        ({"patience": -1.0}, "patience"),
+        ({"tracking": 0.0}, "tracking"),
+        ({"observe": "camera"}, "observe"),
+    ],
+)
+def test_wrong_arguments_are_named(options: dict[str, Any], error: str) -> None:
+    plan = plan_door()
+    with pytest.raises(InputError, match=error):
+        execute(plan, IdealRobot(plan.scene, is_simulated=True), **options)
+
+
+def test_robot_must_have_the_methods_of_a_robot() -> None:
+    with pytest.raises(InputError, match=r"robot.*methods of `Robot`"):
+        execute(plan_door(), object())  # type: ignore[arg-type]
+
+
+def test_plan_must_be_a_success() -> None:
+    failed = vkc.plan(vkc.load_scene("door"), [vkc.GoTo(2.55, 1.3)], max_evaluations=1000)
+    with pytest.raises(InputError, match="no success"):
+        execute(failed, IdealRobot(failed.scene, is_simulated=True))
+
+
+# --- the ideal robot
+# ------------------------------------------------------------------------------------------------
+
+
+def make_line(length: float) -> Trajectory:
+    plan = plan_door()
+    positions = np.tile(plan.scene.start, (2, 1))
+    positions[1, 0] += length
+    names = plan.scene.robot.coordinates.names
+    phases = (vkc.PhaseSpan("go to", 0, 1),)
+    return Trajectory(names, np.array([0.0, 1.0]), positions, phases, SIZE)
+
+
+def test_later_motion_replaces_what_follows() -> None:
+    robot = IdealRobot(plan_door().scene, is_simulated=True)
+    x = robot.read().positions[0]
+    robot.send(make_line(1.0), 0.5)
+    robot.send(make_line(-1.0), 1.0)
+    expected = {0.2: x, 0.75: x + 0.25, 1.5: x - 0.5, 9.0: x - 1.0}
+    for time, position in expected.items():
+        assert robot.compute_state(time).positions[0] == pytest.approx(position)
+    robot.send(make_line(0.5), 0.2)  # discards both
+    assert robot.compute_state(9.0).positions[0] == pytest.approx(x + 0.5)
+
+
+def test_motion_cannot_begin_in_the_past_and_stop_stays() -> None:
+    robot = IdealRobot(plan_door().scene, is_simulated=True)
+    robot.send(make_line(1.0), 0.0)
+    robot.wait(0.5)
+    with pytest.raises(InputError, match="this is over"):
+        robot.send(make_line(1.0), 0.4)
+    robot.stop()
+    there = robot.read().positions
+    robot.wait(3.0)
+    np.testing.assert_array_equal(robot.read().positions, there)
+    np.testing.assert_array_equal(robot.read().velocities, 0.0)
+
+
+def test_clock_of_the_computer_goes_on() -> None:
+    robot = IdealRobot(plan_door().scene)
+    before = robot.time
+    robot.wait(before + 0.02)
+    assert robot.time >= before + 0.02

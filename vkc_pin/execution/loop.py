@@ -87,6 +87,7 @@ def execute(
     rate: float = 20.0,
     observe: Observe | None = None,
     lead: float = 0.2,
+    time_limit: float | None = None,
     patience: float = 10.0,
     tracking: float = 0.02,
     planner: Planner | None = None,
@@ -105,6 +106,8 @@ def execute(
         observe: Puts what is known at present into a scene. Default: nothing changes.
         lead: Time from a decision to the begin of the new motion, within which it must be found
             [s].
+        time_limit: Wall-clock limit of planning again [s]. Default: `lead`. More makes sense for a
+            simulated robot whose clock stands still meanwhile.
         patience: Longest time at rest without a motion before execution fails [s].
         tracking: Largest accepted distance from the planned configuration, [m] and [rad].
         planner: Planner whose caches are used.
@@ -122,8 +125,11 @@ def execute(
         raise InputError("cannot be called", field="observe", expected=expected, got=got)
     period = 1.0 / check_number(rate, "rate", "cycles per second", low=0.1, high=1000.0)
     lead = check_number(lead, "lead", "a time [s]", low=period)
+    if time_limit is None:
+        time_limit = lead
+    time_limit = check_number(time_limit, "time_limit", "a time [s]", low=0.0, strict=True)
     patience = check_number(patience, "patience", "a time [s]", low=0.0)
-    loop = _Loop(plan, robot, period, observe, lead, patience, tracking, planner)
+    loop = _Loop(plan, robot, period, observe, lead, time_limit, patience, tracking, planner)
     return loop.run()
 
 
@@ -137,6 +143,7 @@ class _Loop:
         period: float,
         observe: Observe | None,
         lead: float,
+        time_limit: float,
         patience: float,
         tracking: float,
         planner: Planner | None,
@@ -146,6 +153,7 @@ class _Loop:
         self._period = period
         self._observe = observe
         self._lead = lead
+        self._time_limit = time_limit
         self._patience = patience
         self._tracking = tracking
         self._planner = planner
@@ -230,7 +238,7 @@ class _Loop:
             scene = self._look(plan.scene_at(takeover))
             try:
                 found = replan(
-                    plan, takeover, scene=scene, time_limit=self._lead, planner=self._planner
+                    plan, takeover, scene=scene, time_limit=self._time_limit, planner=self._planner
                 )
             except InputError as error:  # the steps are impossible there
                 return self._brake(now, f"{finding.reason}; {error}")
@@ -271,7 +279,7 @@ class _Loop:
         end = float(self._plan.trajectory.times[-1])
         scene = self._look(self._plan.scene_at(end))
         prepared = prepare(scene, steps, options=self._first.options, planner=self._planner)
-        found = prepared.solve(guess=guess, time_limit=max(self._lead, 1.0), explain=False)
+        found = prepared.solve(guess=guess, time_limit=max(self._time_limit, 1.0), explain=False)
         if not found.success:
             return "wait", found.status
         self._waiting = None

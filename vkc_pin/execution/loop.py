@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal
 
 from vkc_pin.errors import InputError, format_value
 from vkc_pin.execution.monitor import Finding, Monitor
+from vkc_pin.execution.record import Cycle, Decision, ExecutionResult
 from vkc_pin.execution.robots import Robot, RobotState
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner
@@ -24,60 +22,7 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 Observe = Callable[[Scene], Scene]
 """Puts what is known at present into a scene: placements of objects and obstacles."""
 
-Decision = Literal["go on", "replan", "brake", "wait", "stop"]
-"""What a cycle did: nothing; sent a new motion; braked on the path; stood still, since no motion
-was found yet; or gave up."""
-
 _BRAKE_DELAY = 0.02  # [s] from the decision to brake to its begin, for sending the motion
-
-
-@dataclass(frozen=True)
-class Cycle:
-    """What happened in one cycle.
-
-    Attributes:
-        time: Begin, on the robot's clock [s].
-        motion_time: Time of the motion that was being executed [s].
-        latency: Time from the measured state to the end of the cycle's work [s].
-        decision: See `Decision`.
-        reason: Why it was not "go on".
-    """
-
-    time: float
-    motion_time: float
-    latency: float
-    decision: Decision
-    reason: str = ""
-
-
-@dataclass(frozen=True, eq=False)
-class ExecutionResult:
-    """The record of an execution.
-
-    Attributes:
-        plan: The plan that it began with.
-        success: Whether the last motion carried out all steps, and the robot followed it.
-        reason: Why it ended without success; else "".
-        cycles: All cycles.
-        plans: Begin on the robot's clock [s] and plan of all motions that were sent.
-        late: Number of cycles that took longer than their period.
-    """
-
-    plan: Plan
-    success: bool
-    reason: str
-    cycles: tuple[Cycle, ...]
-    plans: tuple[tuple[float, Plan], ...]
-    late: int
-
-    def __repr__(self) -> str:
-        verdict = "success" if self.success else f"FAILED: {self.reason}"
-        counts = ", ".join(f"{n} × {name}" for name, n in self.count_decisions().items())
-        return f"<ExecutionResult {verdict}; {counts}>"
-
-    def count_decisions(self) -> dict[str, int]:
-        """Return decision → number of cycles."""
-        return dict(Counter(cycle.decision for cycle in self.cycles))
 
 
 def execute(

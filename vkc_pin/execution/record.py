@@ -1,0 +1,154 @@
+"""Records what a closed loop saw, decided and did."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from vkc_pin.planning.plan import Plan
+from vkc_pin.world.trajectory.phase_span import PhaseSpan
+from vkc_pin.world.trajectory.splicing import concatenate_trajectories, extract_times
+from vkc_pin.world.trajectory.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Decision = Literal["go on", "replan", "brake", "wait", "stop"]
+"""What a cycle did: nothing; sent a new motion; braked on the path; stood still, since no motion
+was found yet; or gave up."""
+
+
+_SHORTEST = 1e-6  # [s] of a part of a motion
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """What happened in one cycle.
+
+    Attributes:
+        time: Begin, on the robot's clock [s].
+        motion_time: Time of the motion that was being executed [s].
+        latency: Time from the measured state to the end of the cycle's work [s].
+        decision: See `Decision`.
+        reason: Why it was not "go on".
+    """
+
+    time: float
+    motion_time: float
+    latency: float
+    decision: Decision
+    reason: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class ExecutionResult:
+    """The record of an execution.
+
+    Attributes:
+        plan: The plan that it began with.
+        success: Whether the last motion carried out all steps, and the robot followed it.
+        reason: Why it ended without success; else "".
+        cycles: All cycles.
+        plans: Begin on the robot's clock [s] and plan of all motions that were sent.
+        late: Number of cycles that took longer than their period.
+    """
+
+    plan: Plan
+    success: bool
+    reason: str
+    cycles: tuple[Cycle, ...]
+    plans: tuple[tuple[float, Plan], ...]
+    late: int
+
+    def __repr__(self) -> str:
+        verdict = "success" if self.success else f"FAILED: {self.reason}"
+        counts = ", ".join(f"{n} × {name}" for name, n in self.count_decisions().items())
+        return f"<ExecutionResult {verdict}; {counts}>"
+
+    def count_decisions(self) -> dict[str, int]:
+        """Return decision → number of cycles."""
+        return dict(Counter(cycle.decision for cycle in self.cycles))
+
+    @property
+    def latencies(self) -> dict[str, list[float]]:
+        """Decision → latencies of its cycles [s]."""
+        found: dict[str, list[float]] = {}
+        for cycle in self.cycles:
+            found.setdefault(cycle.decision, []).append(cycle.latency)
+        return found
+
+    @property
+    def motion(self) -> Trajectory:
+        """The motion that was sent in all, up to the last cycle; it counts from its begin."""
+        parts = list[Trajectory]()
+        ends = [begin for begin, _ in self.plans[1:]]
+        ends.append(self.cycles[-1].time if self.cycles else np.inf)
+        for (begin, plan), end in zip(self.plans, ends, strict=True):
+            whole = plan.trajectory
+            first = float(whole.times[0])
+            last = min(first + end - begin, float(whole.times[-1]))
+            if last - first > _SHORTEST:
+                parts.append(extract_times(whole, first, last))
+            rest = end - begin - (last - first)
+            if parts and np.isfinite(rest) and rest > _SHORTEST:
+                parts.append(_stand(parts[-1], rest))
+        return concatenate_trajectories(parts, pause=0.0)
+
+    def summary(self) -> str:
+        """Return what was decided, when and why, one decision a line."""
+        lines = [repr(self)]
+        for cycle in self.cycles:
+            if cycle.decision != "go on":
+                took = f"{1e3 * cycle.latency:.0f} ms"
+                reason = f": {cycle.reason}" if cycle.reason else ""
+                lines.append(f"  {cycle.time:7.2f} s  {cycle.decision} ({took}){reason}")
+        return "\n".join(lines)
+
+    def to_html(self, path: str | Path) -> Path:
+        """Write a page with the motion as it was sent, in the world as it was known last."""
+        first, last = self.plan, self.plans[-1][1]
+        scene = last.scene.with_held(first.scene.holds)
+        scene = scene.with_start(base=first.scene.start[:3], arm=first.scene.start[3:])
+        for name, placed in first.scene.objects.items():
+            joints = zip(placed.object.coordinates.names, placed.state.tolist(), strict=True)
+            state = dict(joints)
+            scene = scene.with_state(name, state) if state else scene
+        shown = replace(last, scene=scene, steps=first.steps, trajectory=self.motion)
+        return shown.to_html(path)
+
+    def plot(self, path: str | Path | None = None) -> Figure:
+        """Plot latencies and decisions over time.
+
+        Args:
+            path: Picture to write (.png, .svg or .pdf). Default: none.
+        """
+        from vkc_pin.visualization.plots.style import new_figure, save_figure, use_style
+
+        with use_style():
+            figure = new_figure(7.2, 2.6)
+            axes: Any = figure.add_subplot()
+            for decision in self.count_decisions():
+                cycles = [cycle for cycle in self.cycles if cycle.decision == decision]
+                times = [cycle.time for cycle in cycles]
+                latencies = [1e3 * cycle.latency for cycle in cycles]
+                axes.plot(times, latencies, "o", markersize=3, label=decision)
+            axes.set_yscale("log")
+            axes.set_xlabel("time [s]")
+            axes.set_ylabel("latency [ms]")
+            axes.legend(loc="upper right")
+            if path is not None:
+                save_figure(figure, path)
+        return figure
+
+
+def _stand(before: Trajectory, duration: float) -> Trajectory:
+    """Return a motion that stands still where another ends."""
+    last = before.positions[-1]
+    phase = before.phases[-1]
+    span = PhaseSpan("stand still", 0, 1, phase.holds, phase.opening)
+    times = np.array([0.0, duration])
+    return Trajectory(before.names, times, np.array([last, last]), (span,), before.robot_size)

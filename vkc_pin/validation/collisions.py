@@ -281,6 +281,7 @@ def sweep(
     z: Floats,
     waypoints: Ints,
     *,
+    moved: Floats | None = None,
     first_row: int = 0,
     deepest_only: Bools | None = None,
 ) -> Iterator[Hit]:
@@ -290,12 +291,15 @@ def sweep(
         table: P pairs that could collide.
         z: Configurations of the world, shape (S, n), evenly spaced between waypoints.
         waypoints: Rows of `z` that are the waypoints, shape (T,).
+        moved: Result of `bound_displacements` for `z`, if it exists already.
         first_row: First row of `z` that is searched.
         deepest_only: Pairs of which only the deepest overlap matters, shape (P,). If given, pairs
             that violate no clearance are not searched. Default: the closest pair of each waypoint
             is yielded, too, and that of the whole motion.
     """
-    return _Sweep(table, waypoints, first_row, deepest_only).find_hits(z)
+    if moved is None:
+        moved = bound_displacements(table.solids, z)
+    return _Sweep(table, waypoints, first_row, deepest_only).find_hits(z, moved)
 
 
 class _Sweep:
@@ -315,7 +319,7 @@ class _Sweep:
         if deepest_only is not None:
             self._deepest_only = deepest_only
 
-    def find_hits(self, z: Floats) -> Iterator[Hit]:
+    def find_hits(self, z: Floats, moved: Floats) -> Iterator[Hit]:
         waypoints = self._waypoints
         placed = self._place(z[waypoints])
         at, pairs, distances = self._find_nearest(placed)
@@ -333,7 +337,6 @@ class _Sweep:
         smallest = RESOLUTION
         if not self._close_only:
             smallest = max(RESOLUTION, float(distances[closest].min(initial=np.inf)))
-        moved = bound_displacements(self._solids, z)
         segments, pairs = self._find_active_pairs(
             placed, np.diff(moved[waypoints], axis=0), smallest
         )

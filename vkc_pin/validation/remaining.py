@@ -12,14 +12,13 @@ import pinocchio as pin
 from vkc_pin.errors import InputError, format_value
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import check_instance, check_number
-from vkc_pin.validation.clearance import check_clearance
+from vkc_pin.validation.clearance import ClearanceCheck
 from vkc_pin.validation.report import Violation, select_worst
 from vkc_pin.validation.tolerances import Tolerances
 from vkc_pin.validation.validate import check_arguments
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Step
 from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.trajectory.world_model import World
 
 # attributes of a scene that no obstacle changes, and entries of its document
 _FIXED_FIELDS = (
@@ -73,17 +72,17 @@ class RemainingCheck:
         *,
         tolerances: Tolerances | None = None,
     ) -> None:
-        self._options = Options() if options is None else options
-        check_instance(self._options, Options, "options")
-        self._tolerances = Tolerances() if tolerances is None else tolerances
-        check_instance(self._tolerances, Tolerances, "tolerances")
-        self._samples, self._steps, _ = check_arguments(scene, steps, trajectory)
+        options = Options() if options is None else check_instance(options, Options, "options")
+        tolerances = Tolerances() if tolerances is None else tolerances
+        check_instance(tolerances, Tolerances, "tolerances")
+        self._samples, asked, _ = check_arguments(scene, steps, trajectory)
         self._scene = scene
         self._document = scene.document
         if self._samples.is_truncated:
             raise InputError(
                 "the motion is too long to be checked for collisions", field="trajectory"
             )
+        self._clearance = ClearanceCheck(self._samples, asked, options, tolerances)
 
     def find_violations(self, scene: Scene, time: float = 0.0) -> tuple[Violation, ...]:
         """Find the collisions of the remaining motion with obstacles that have changed.
@@ -115,14 +114,7 @@ class RemainingCheck:
             obstacle_labels=tuple(scene.obstacle_labels[k] for k in changed),
         )
         row = int(np.searchsorted(self._samples.times, time, side="right")) - 1
-        found = check_clearance(
-            self._samples,
-            self._steps,
-            self._options,
-            self._tolerances,
-            obstacles=World(alone),
-            first_row=max(row, 0),
-        )
+        found = self._clearance.check_obstacles(alone, max(row, 0))
         return select_worst(found.violations)
 
     def _check_unchanged(self, scene: Scene) -> None:

@@ -20,18 +20,23 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Step
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-# attributes of a scene that no obstacle changes, and entries of its document
-_FIXED_FIELDS = (
-    "robot",
-    "start",
-    "opening",
-    "holds",
-    "objects",
-    "allowed",
-    "arena",
-    "floor",
-)
-_FIXED_ENTRIES = ("robot", "start", "arena", "floor", "allow")
+# attributes of a scene that may differ from the prepared one
+_FREE_FIELDS = {
+    "name",
+    "file",
+    "folder",
+    "obstacles",
+    "obstacle_labels",
+    "obstacle_names",
+    "obstacle_visual",
+    "obstacle_visual_labels",
+    "start_region",
+    "described",
+    "memory",
+}
+_FIXED_FIELDS = {field.name for field in dataclasses.fields(Scene)} - _FREE_FIELDS
+# entries of its document that may differ, or are compared one by one
+_FREE_ENTRIES = {"name", "obstacles", "objects", "start_region"}
 
 
 class RemainingCheck:
@@ -122,8 +127,10 @@ class RemainingCheck:
         if all(getattr(scene, name) is getattr(self._scene, name) for name in _FIXED_FIELDS):
             return  # as `Scene.with_obstacle` leaves them
         document = scene.document
-        for name in _FIXED_ENTRIES:
-            _check_same_entry(document.get(name), self._document.get(name), name)
+        entries = dict.fromkeys([*self._document, *document])
+        for name in entries:
+            if name not in _FREE_ENTRIES:
+                _check_same_entry(document.get(name), self._document.get(name), name)
         objects = _index_by_name(self._document["objects"])
         new_objects = _index_by_name(document["objects"])
         for name in dict.fromkeys([*objects, *new_objects]):

@@ -327,6 +327,7 @@ class _Sweep:
         apart = np.flatnonzero(margins > -np.inf)  # pairs that do not move together
         closest = apart[_find_group_minima(at[apart], distances[apart])]
         is_exempt = self._table.find_exempt(pairs, at) & (distances < self._table.margins[pairs])
+        # All overlaps at waypoints are yielded; between them only deeper ones may matter.
         self._select_overlaps(waypoints[at], pairs, distances)
         is_close = distances < np.maximum(margins, 0.0)
         chosen = np.union1d(closest, np.flatnonzero(is_close | is_exempt))
@@ -389,8 +390,8 @@ class _Sweep:
     def _select_overlaps(self, rows: Ints, pairs: Ints, distances: Floats) -> Ints:
         """Return the indices of overlaps that matter, of distances of pairs at rows, shape (n,).
 
-        Of some pairs only the deepest overlap matters: those that are no deeper than an earlier one
-        are left out.
+        Of some pairs only the deepest overlap matters: it is noted, and those that are no deeper
+        than an earlier one are left out.
         """
         matters = (rows >= self._first_row) & (distances < np.minimum(0.0, self._deepest[pairs]))
         overlaps = np.flatnonzero(matters)
@@ -461,7 +462,7 @@ class _Sweep:
             smallest = np.full(len(placed), np.inf)
             is_apart = self._table.get_margins(pairs, states) > -np.inf
             np.minimum.at(smallest, states[is_apart], distances[is_apart])
-            # All other pairs are further apart.
+            # All other pairs are further apart, or do not matter.
             is_done = ~(smallest > reach) | self._close_only
             is_kept = is_done[states]
             found.append((states[is_kept], pairs[is_kept], distances[is_kept]))

@@ -255,6 +255,7 @@ PUBLIC_PACKAGES = (
     "importing",
     "procedural",
     "simulation",
+    "validation",
     "visualization",
     "visualization.plots",
 )

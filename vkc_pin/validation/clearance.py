@@ -8,20 +8,20 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from vkc_pin.options import Options
-from vkc_pin.utils.arrays import Bools, Ints
+from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.validation.collisions import Hit, PairTable, sweep
 from vkc_pin.validation.contact_windows import find_contact_windows
-from vkc_pin.validation.distances import CollisionShapes
+from vkc_pin.validation.distances import CollisionShapes, bound_displacements
 from vkc_pin.validation.neighbours import ExemptPairs, find_exempt_pairs
 from vkc_pin.validation.report import Exemption, Violation
 from vkc_pin.validation.samples import Samples
 from vkc_pin.validation.tolerances import Tolerances
 from vkc_pin.world.scene.clearance_exemptions import ACCEPTED_SHORTFALL, CONTACT_DEPTH
+from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Step
-from vkc_pin.world.trajectory.world_model import World
 
 
-class ClearanceCheck:
+class ClearanceResult:
     """Result of the check of clearances and penetrations.
 
     Attributes:
@@ -101,16 +101,8 @@ class ClearanceCheck:
         self.exemptions[hit.first, hit.second] = Exemption(subject, hit.distance, reason)
 
 
-def check_clearance(
-    samples: Samples,
-    steps: Sequence[Step],
-    options: Options,
-    tolerances: Tolerances,
-    *,
-    obstacles: World | None = None,
-    first_row: int = 0,
-) -> ClearanceCheck:
-    """Check the clearance at waypoints (eqs. 6 and 7), and that nothing penetrates anywhere.
+class ClearanceCheck:
+    """Checks the clearance at waypoints (eqs. 6 and 7), and that nothing penetrates anywhere.
 
     Pairs that move together are ignored. At the start the clearance may be violated, since the
     robot is already there, but nothing may penetrate.
@@ -120,48 +112,79 @@ def check_clearance(
         steps: Steps of the motion.
         options: Clearances to keep.
         tolerances: Accepted errors of goals.
-        obstacles: World with the robot and the objects of the samples, whose obstacles are checked
-            instead of theirs, and nothing else. Default: all pairs of the samples are checked.
-        first_row: First sample that is checked.
     """
-    obstacles_only = obstacles is not None
-    world = samples.world if obstacles is None else obstacles
-    solids = CollisionShapes(world)
-    windows = find_contact_windows(
-        samples, solids, steps, options, tolerances, obstacles_only=obstacles_only
-    )
-    table = PairTable(
-        world.scene,
-        solids,
-        samples.trajectory,
-        options.dist_safe,
-        options.self_distance,
-        windows=windows,
-        samples=samples,
-        obstacles_only=obstacles_only,
-    )
-    exemptions: dict[tuple[int, int], list[ExemptPairs]] = {}
-    exempt_pairs = find_exempt_pairs(
-        world.scene, solids, options.dist_safe, obstacles_only=obstacles_only
-    )
-    for one in exempt_pairs:
-        for first, second in one.pairs.tolist():
-            exemptions.setdefault((first, second), []).append(one)
-    deepest_only = None
-    if obstacles_only:
-        # Where a pair may overlap for a while, its deepest overlap need not be a violation.
-        deepest_only = ~(table.have_windows | _are_listed(table.pairs, exemptions))
-    check = ClearanceCheck(samples)
-    hits = sweep(
-        table,
-        samples.z,
-        samples.waypoint_rows,
-        first_row=first_row,
-        deepest_only=deepest_only,
-    )
-    for hit in hits:
-        check.add(hit, exemptions.get(hit.shapes, []))
-    return check
+
+    def __init__(
+        self, samples: Samples, steps: Sequence[Step], options: Options, tolerances: Tolerances
+    ) -> None:
+        self._samples = samples
+        self._steps = steps
+        self._options = options
+        self._tolerances = tolerances
+        self._solids = CollisionShapes(samples.world)
+        self._moved = bound_displacements(self._solids, samples.z)
+
+    def check_all(self) -> ClearanceResult:
+        """Check all pairs of the motion."""
+        return self._check(self._solids, self._moved, obstacles_only=False, first_row=0)
+
+    def check_obstacles(self, scene: Scene, first_row: int) -> ClearanceResult:
+        """Check only the obstacles of another scene, from a sample to the end.
+
+        Args:
+            scene: The scene of the motion with the obstacles that are checked.
+            first_row: First sample that is checked.
+        """
+        solids = self._solids.with_obstacles(scene)
+        moved = np.zeros((len(self._moved), len(solids.world.shapes)))
+        bodies = slice(solids.body_count)
+        moved[:, bodies] = self._moved[:, bodies]
+        return self._check(solids, moved, obstacles_only=True, first_row=first_row)
+
+    def _check(
+        self, solids: CollisionShapes, moved: Floats, *, obstacles_only: bool, first_row: int
+    ) -> ClearanceResult:
+        samples = self._samples
+        scene = solids.world.scene
+        dist_safe = self._options.dist_safe
+        windows = find_contact_windows(
+            samples,
+            solids,
+            self._steps,
+            self._options,
+            self._tolerances,
+            obstacles_only=obstacles_only,
+        )
+        table = PairTable(
+            scene,
+            solids,
+            samples.trajectory,
+            dist_safe,
+            self._options.self_distance,
+            windows=windows,
+            samples=samples,
+            obstacles_only=obstacles_only,
+        )
+        exemptions: dict[tuple[int, int], list[ExemptPairs]] = {}
+        for one in find_exempt_pairs(scene, solids, dist_safe, obstacles_only=obstacles_only):
+            for first, second in one.pairs.tolist():
+                exemptions.setdefault((first, second), []).append(one)
+        deepest_only = None
+        if obstacles_only:
+            # Where a pair may overlap for a while, its deepest overlap need not be a violation.
+            deepest_only = ~(table.have_windows | _are_listed(table.pairs, exemptions))
+        result = ClearanceResult(samples)
+        hits = sweep(
+            table,
+            samples.z,
+            samples.waypoint_rows,
+            moved=moved,
+            first_row=first_row,
+            deepest_only=deepest_only,
+        )
+        for hit in hits:
+            result.add(hit, exemptions.get(hit.shapes, []))
+        return result
 
 
 def _are_listed(pairs: Ints, listed: Collection[tuple[int, int]]) -> Bools:

@@ -281,6 +281,7 @@ def sweep(
     z: Floats,
     waypoints: Ints,
     *,
+    moved: Floats | None = None,
     first_row: int = 0,
     deepest_only: Bools | None = None,
 ) -> Iterator[Hit]:
@@ -290,12 +291,15 @@ def sweep(
         table: P pairs that could collide.
         z: Configurations of the world, shape (S, n), evenly spaced between waypoints.
         waypoints: Rows of `z` that are the waypoints, shape (T,).
+        moved: Result of `bound_displacements` for `z`, if it exists already.
         first_row: First row of `z` that is searched.
         deepest_only: Pairs of which only the deepest overlap matters, shape (P,). If given, pairs
             that violate no clearance are not searched. Default: the closest pair of each waypoint
             is yielded, too, and that of the whole motion.
     """
-    return _Sweep(table, waypoints, first_row, deepest_only).find_hits(z)
+    if moved is None:
+        moved = bound_displacements(table.solids, z)
+    return _Sweep(table, waypoints, first_row, deepest_only).find_hits(z, moved)
 
 
 class _Sweep:
@@ -315,7 +319,7 @@ class _Sweep:
         if deepest_only is not None:
             self._deepest_only = deepest_only
 
-    def find_hits(self, z: Floats) -> Iterator[Hit]:
+    def find_hits(self, z: Floats, moved: Floats) -> Iterator[Hit]:
         waypoints = self._waypoints
         placed = self._place(z[waypoints])
         at, pairs, distances = self._find_nearest(placed)
@@ -323,6 +327,7 @@ class _Sweep:
         apart = np.flatnonzero(margins > -np.inf)  # pairs that do not move together
         closest = apart[_find_group_minima(at[apart], distances[apart])]
         is_exempt = self._table.find_exempt(pairs, at) & (distances < self._table.margins[pairs])
+        # All overlaps at waypoints are yielded; between them only deeper ones may matter.
         self._select_overlaps(waypoints[at], pairs, distances)
         is_close = distances < np.maximum(margins, 0.0)
         chosen = np.union1d(closest, np.flatnonzero(is_close | is_exempt))
@@ -333,7 +338,6 @@ class _Sweep:
         smallest = RESOLUTION
         if not self._close_only:
             smallest = max(RESOLUTION, float(distances[closest].min(initial=np.inf)))
-        moved = bound_displacements(self._solids, z)
         segments, pairs = self._find_active_pairs(
             placed, np.diff(moved[waypoints], axis=0), smallest
         )
@@ -386,8 +390,8 @@ class _Sweep:
     def _select_overlaps(self, rows: Ints, pairs: Ints, distances: Floats) -> Ints:
         """Return the indices of overlaps that matter, of distances of pairs at rows, shape (n,).
 
-        Of some pairs only the deepest overlap matters: those that are no deeper than an earlier one
-        are left out.
+        Of some pairs only the deepest overlap matters: it is noted, and those that are no deeper
+        than an earlier one are left out.
         """
         matters = (rows >= self._first_row) & (distances < np.minimum(0.0, self._deepest[pairs]))
         overlaps = np.flatnonzero(matters)
@@ -458,7 +462,7 @@ class _Sweep:
             smallest = np.full(len(placed), np.inf)
             is_apart = self._table.get_margins(pairs, states) > -np.inf
             np.minimum.at(smallest, states[is_apart], distances[is_apart])
-            # All other pairs are further apart.
+            # All other pairs are further apart, or do not matter.
             is_done = ~(smallest > reach) | self._close_only
             is_kept = is_done[states]
             found.append((states[is_kept], pairs[is_kept], distances[is_kept]))

@@ -6,6 +6,7 @@ with the planner's culling, so that its errors would be found here.
 
 from __future__ import annotations
 
+import copy
 from functools import cached_property
 
 import coal
@@ -18,6 +19,7 @@ from vkc_pin.world.collision.distances import Shapes
 from vkc_pin.world.collision.solids import ShapePlacements, flatten_placements
 from vkc_pin.world.models.coordinates import MovedJoint
 from vkc_pin.world.models.shapes import compute_bounding_box, compute_shape_distance
+from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.world_model import World
 
 # radius of the sphere that stands for a point [m]
@@ -32,9 +34,23 @@ class CollisionShapes:
     """
 
     def __init__(self, world: World) -> None:
-        self.world = world
         self.body_count = len(world.bodies.geometryObjects)
-        boxes = [compute_bounding_box(shape) for shape in world.shapes]
+        bodies = world.shapes[: self.body_count]
+        self._body_boxes = [compute_bounding_box(shape) for shape in bodies]
+        self._placements = ShapePlacements(world.model, world.bodies)
+        self._set_obstacles(world)
+
+    def with_obstacles(self, scene: Scene) -> CollisionShapes:
+        """Return a copy with the obstacles of another scene; see `World.with_obstacles`."""
+        other = copy.copy(self)
+        other._set_obstacles(self.world.with_obstacles(scene))
+        return other
+
+    def _set_obstacles(self, world: World) -> None:
+        """Set the attributes that depend on the obstacles of a world with the same bodies."""
+        self.world = world
+        boxes = list(self._body_boxes)
+        boxes += [compute_bounding_box(shape) for shape in world.shapes[self.body_count :]]
         self.center = np.array([center for center, _ in boxes]).reshape(-1, 3)
         self.half = np.array([half for _, half in boxes]).reshape(-1, 3)
         obstacles = slice(self.body_count, None)
@@ -42,7 +58,6 @@ class CollisionShapes:
         geometries = [shape.geometry for shape in world.shapes]
         self.distance_queries = Shapes(geometries, placements)
         self.obstacle_corners = self.compute_corners(flatten_placements(placements), obstacles)
-        self._placements = ShapePlacements(world.model, world.bodies)
 
     def place(self, q: Floats) -> PlacedShapes:
         """Place the shapes at Pinocchio's configurations of the world, shape (W, nq)."""

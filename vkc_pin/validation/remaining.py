@@ -12,27 +12,31 @@ import pinocchio as pin
 from vkc_pin.errors import InputError, format_value
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import check_instance, check_number
-from vkc_pin.validation.clearance import check_clearance
+from vkc_pin.validation.clearance import ClearanceCheck
 from vkc_pin.validation.report import Violation, select_worst
 from vkc_pin.validation.tolerances import Tolerances
 from vkc_pin.validation.validate import check_arguments
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Step
 from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.trajectory.world_model import World
 
-# attributes of a scene that no obstacle changes, and entries of its document
-_FIXED_FIELDS = (
-    "robot",
-    "start",
-    "opening",
-    "holds",
-    "objects",
-    "allowed",
-    "arena",
-    "floor",
-)
-_FIXED_ENTRIES = ("robot", "start", "arena", "floor", "allow")
+# attributes of a scene that may differ from the prepared one
+_FREE_FIELDS = {
+    "name",
+    "file",
+    "folder",
+    "obstacles",
+    "obstacle_labels",
+    "obstacle_names",
+    "obstacle_visual",
+    "obstacle_visual_labels",
+    "start_region",
+    "described",
+    "memory",
+}
+_FIXED_FIELDS = {field.name for field in dataclasses.fields(Scene)} - _FREE_FIELDS
+# entries of its document that may differ, or are compared one by one
+_FREE_ENTRIES = {"name", "obstacles", "objects", "start_region"}
 
 
 class RemainingCheck:
@@ -73,17 +77,17 @@ class RemainingCheck:
         *,
         tolerances: Tolerances | None = None,
     ) -> None:
-        self._options = Options() if options is None else options
-        check_instance(self._options, Options, "options")
-        self._tolerances = Tolerances() if tolerances is None else tolerances
-        check_instance(self._tolerances, Tolerances, "tolerances")
-        self._samples, self._steps, _ = check_arguments(scene, steps, trajectory)
+        options = Options() if options is None else check_instance(options, Options, "options")
+        tolerances = Tolerances() if tolerances is None else tolerances
+        check_instance(tolerances, Tolerances, "tolerances")
+        self._samples, asked, _ = check_arguments(scene, steps, trajectory)
         self._scene = scene
         self._document = scene.document
         if self._samples.is_truncated:
             raise InputError(
                 "the motion is too long to be checked for collisions", field="trajectory"
             )
+        self._clearance = ClearanceCheck(self._samples, asked, options, tolerances)
 
     def find_violations(self, scene: Scene, time: float = 0.0) -> tuple[Violation, ...]:
         """Find the collisions of the remaining motion with obstacles that have changed.
@@ -115,14 +119,7 @@ class RemainingCheck:
             obstacle_labels=tuple(scene.obstacle_labels[k] for k in changed),
         )
         row = int(np.searchsorted(self._samples.times, time, side="right")) - 1
-        found = check_clearance(
-            self._samples,
-            self._steps,
-            self._options,
-            self._tolerances,
-            obstacles=World(alone),
-            first_row=max(row, 0),
-        )
+        found = self._clearance.check_obstacles(alone, max(row, 0))
         return select_worst(found.violations)
 
     def _check_unchanged(self, scene: Scene) -> None:
@@ -130,8 +127,10 @@ class RemainingCheck:
         if all(getattr(scene, name) is getattr(self._scene, name) for name in _FIXED_FIELDS):
             return  # as `Scene.with_obstacle` leaves them
         document = scene.document
-        for name in _FIXED_ENTRIES:
-            _check_same_entry(document.get(name), self._document.get(name), name)
+        entries = dict.fromkeys([*self._document, *document])
+        for name in entries:
+            if name not in _FREE_ENTRIES:
+                _check_same_entry(document.get(name), self._document.get(name), name)
         objects = _index_by_name(self._document["objects"])
         new_objects = _index_by_name(document["objects"])
         for name in dict.fromkeys([*objects, *new_objects]):

@@ -15,7 +15,7 @@ import pinocchio as pin
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import check_instance
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.validation.clearance import ClearanceCheck, check_clearance
+from vkc_pin.validation.clearance import ClearanceCheck, ClearanceResult
 from vkc_pin.validation.closure import find_drift
 from vkc_pin.validation.contact_windows import check_gripper, check_pushes
 from vkc_pin.validation.goals import MOTION_TOLERANCE, check_goals, check_steps
@@ -102,9 +102,9 @@ def validate(
     excess = list(_check_sample_count(samples))
     if excess:
         violations += excess
-        clearance = ClearanceCheck(samples)
+        clearance = ClearanceResult(samples)
     else:
-        clearance = check_clearance(samples, asked, options, tolerances)
+        clearance = ClearanceCheck(samples, asked, options, tolerances).check_all()
         violations += clearance.violations
     motor_fields = motors.summarize(options.jerk_time)
     return Report(

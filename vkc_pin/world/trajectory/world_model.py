@@ -7,6 +7,7 @@ computes. The fingers of a gripper are joints.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -71,11 +72,8 @@ class World:
             )
         objects = {name: placed.object.collision for name, placed in scene.objects.items()}
         self.bodies = self._graft_all(robot.collision, objects)
-        self.shapes = (*self.bodies.geometryObjects, *scene.obstacles)
-        links = [get_link_name(shape.name) for shape in self.bodies.geometryObjects]
-        self.collision_labels = [*links, *scene.obstacle_labels]
-        shape_names = [shape.name for shape in self.shapes]
-        self.collision_keys = make_shape_keys(self.collision_labels, shape_names)
+        self._body_shapes = tuple(self.bodies.geometryObjects)
+        self._set_obstacles(scene)
         self.coordinates = Coordinates(self.model)
         start = [np.asarray(scene.start)]
         if robot.gripper is not None:
@@ -85,6 +83,23 @@ class World:
                 start.append(to_free_joint_positions(placed.placement))
             start.append(placed.state)
         self.start: Floats = np.concatenate(start)
+
+    def with_obstacles(self, scene: Scene) -> World:
+        """Return the world of a scene that differs in obstacles alone; it shares all the rest."""
+        other = copy.copy(self)
+        for name in ("collision", "visual", "visual_labels"):
+            vars(other).pop(name, None)
+        other._set_obstacles(scene)
+        return other
+
+    def _set_obstacles(self, scene: Scene) -> None:
+        """Set the attributes that depend on the obstacles of a scene."""
+        self.scene = scene
+        self.shapes = (*self._body_shapes, *scene.obstacles)
+        links = [get_link_name(shape.name) for shape in self._body_shapes]
+        self.collision_labels = [*links, *scene.obstacle_labels]
+        shape_names = [shape.name for shape in self.shapes]
+        self.collision_keys = make_shape_keys(self.collision_labels, shape_names)
 
     @cached_property
     def collision(self) -> pin.GeometryModel:

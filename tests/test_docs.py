@@ -251,6 +251,7 @@ def find_documented() -> set[str]:
 # Packages with public names that are not in `vkc_pin` itself.
 PUBLIC_PACKAGES = (
     "datasets",
+    "execution",
     "experiments.baselines",
     "importing",
     "procedural",

@@ -53,6 +53,7 @@ class Draft:
         initialization: Name of the initial guess it came from.
         history: One row per round of the solver.
         terms: Constraints and costs of the user.
+        end_velocities: Velocities at start and end, shape (2, n); see `retime_trajectory`.
     """
 
     scene: Scene
@@ -64,6 +65,7 @@ class Draft:
     initialization: str
     history: Sequence[Mapping[str, float]]
     terms: tuple[Term, ...]
+    end_velocities: Floats | None = None
 
     def complete(self) -> Plan:
         """Return the plan: the trajectory retimed and validated."""
@@ -78,6 +80,7 @@ class Draft:
             check,
             jerk_time=self.options.jerk_time,
             terms=self.terms,
+            end_velocities=self.end_velocities,
         )
         took = PlanningStatistics(planning_time=time.perf_counter() - began)
         return Plan(

@@ -202,6 +202,7 @@ class TaskSearch:
                 best.name,
                 history,
                 request.terms,
+                None if best.problem is None else best.problem.end_velocities,
             )
         else:
             plan = Plan(

@@ -115,6 +115,12 @@ EXPECTED: dict[str, dict[str, tuple[str, ...]]] = {
         "pose": ("^shelf_scene0065: success — reach with panda_hand_tcp", VALID),
         "driving": ("joint values +success", "pose +success", r"driving +success: base [0-9.]+ m"),
     },
+    "12_closed_loop": {
+        "rest": ("^door: success — reach door.handle", r"largest jump of a velocity: \d\.\de-1\d"),
+        "stop": (r"(at \d.0 s: success, at rest after 0\.\d\d s\n){3}",),
+        "loop": (r"^<ExecutionResult success", "replan .*door is elsewhere"),
+        "person": (r"^<ExecutionResult success", r"(replan|brake) .*stool"),
+    },
 }
 
 

@@ -15,7 +15,15 @@ from PIL import Image
 
 from docs.pictures import IMAGES
 
-NAMES = ("architecture", "gallery", "initial_guesses", "scenes", "separation", "tradeoff")
+NAMES = (
+    "architecture",
+    "closed_loop",
+    "gallery",
+    "initial_guesses",
+    "scenes",
+    "separation",
+    "tradeoff",
+)
 COLOURS = 256
 
 

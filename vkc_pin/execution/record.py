@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from vkc_pin.planning.plan import Plan
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.splicing import concatenate_trajectories, extract_times
 from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import World
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -108,41 +109,49 @@ class ExecutionResult:
                 lines.append(f"  {cycle.time:7.2f} s  {cycle.decision} ({took}){reason}")
         return "\n".join(lines)
 
-    def to_html(self, path: str | Path) -> Path:
-        """Write a page with the motion as it was sent, in the world as it was known last."""
-        first, last = self.plan, self.plans[-1][1]
-        scene = last.scene.with_held(first.scene.holds)
-        scene = scene.with_start(base=first.scene.start[:3], arm=first.scene.start[3:])
-        for name, placed in first.scene.objects.items():
+    @property
+    def executed(self) -> Plan:
+        """The motion as it was sent, in the world as it was known last, as a plan to be shown."""
+        first, last = self.plan.scene, self.plans[-1][1]
+        scene = last.scene.with_held(first.holds)
+        scene = scene.with_start(base=first.start[:3], arm=first.start[3:], velocity={})
+        for name, placed in first.objects.items():
             joints = zip(placed.object.coordinates.names, placed.state.tolist(), strict=True)
             state = dict(joints)
             scene = scene.with_state(name, state) if state else scene
-        shown = replace(last, scene=scene, steps=first.steps, trajectory=self.motion)
-        return shown.to_html(path)
+        return replace(last, scene=scene, steps=self.plan.steps, trajectory=self.motion)
+
+    def to_html(self, path: str | Path) -> Path:
+        """Write a page that plays `executed`."""
+        return self.executed.to_html(path)
 
     def plot(self, path: str | Path | None = None) -> Figure:
-        """Plot latencies and decisions over time.
+        """Plot a top view of `executed`, and the latencies and decisions of all cycles.
 
         Args:
             path: Picture to write (.png, .svg or .pdf). Default: none.
         """
-        from vkc_pin.visualization.plots.style import new_figure, save_figure, use_style
+        from vkc_pin.visualization.plots.style import COLOURS, new_figure, save_figure, use_style
+        from vkc_pin.visualization.plots.top_view import draw_top_view
 
         with use_style():
-            figure = new_figure(7.2, 2.6)
-            axes: Any = figure.add_subplot()
-            for decision in self.count_decisions():
+            figure = new_figure(10.0, 4.2)
+            parts: Any = figure.subfigures(1, 2)
+            left, right = parts
+            executed = self.executed
+            draw_top_view(left, World(executed.scene), executed.trajectory, columns=3)
+            axes: Any = right.subplots()
+            for decision, colour in zip(get_args(Decision), COLOURS, strict=False):
                 cycles = [cycle for cycle in self.cycles if cycle.decision == decision]
-                times = [cycle.time for cycle in cycles]
-                latencies = [1e3 * cycle.latency for cycle in cycles]
-                axes.plot(times, latencies, "o", markersize=3, label=decision)
+                if cycles:
+                    times = [cycle.time for cycle in cycles]
+                    latencies = [1e3 * cycle.latency for cycle in cycles]
+                    axes.plot(times, latencies, "o", color=colour, markersize=3, label=decision)
             axes.set_yscale("log")
             axes.set_xlabel("time [s]")
             axes.set_ylabel("latency [ms]")
             axes.legend(loc="upper right")
-            if path is not None:
-                save_figure(figure, path)
-        return figure
+        return save_figure(figure, path)
 
 
 def _stand(before: Trajectory, duration: float) -> Trajectory:

@@ -1,0 +1,55 @@
+"""Tests the record of an execution."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import vkc_pin as vkc
+from docs.pictures.closed_loop import walk_by
+from vkc_pin.execution import ExecutionResult
+
+
+@cache
+def execute_beside_a_person() -> ExecutionResult:
+    result = walk_by()
+    assert result.success, result.summary()
+    return result
+
+
+def test_every_decision_is_recorded() -> None:
+    result = execute_beside_a_person()
+    counts = result.count_decisions()
+    assert sum(counts.values()) == len(result.cycles)
+    assert {name: len(times) for name, times in result.latencies.items()} == counts
+    lines = result.summary().splitlines()
+    assert len(lines) == 1 + len(result.cycles) - counts["go on"]
+    assert all(cycle.reason for cycle in result.cycles if cycle.decision != "go on")
+    times = [cycle.time for cycle in result.cycles]
+    assert times == sorted(times)
+
+
+def test_motion_is_what_was_sent() -> None:
+    result = execute_beside_a_person()
+    motion = result.motion
+    begin = result.plans[0][0]
+    assert motion.times[-1] == pytest.approx(result.cycles[-1].time - begin, abs=1e-6)
+    ends = [start for start, _ in result.plans[1:]]
+    ends.append(result.cycles[-1].time)
+    for (start, plan), end in zip(result.plans, ends, strict=True):
+        for time in np.linspace(start, end, 9)[1:-1]:
+            sent = plan.trajectory.at(time - start)[:9]
+            np.testing.assert_allclose(motion.at(time - begin)[:9], sent, atol=1e-9)
+    assert motion.column("door.hinge")[-1] == pytest.approx(1.2, abs=1e-3)
+
+
+def test_execution_is_shown(tmp_path: Path) -> None:
+    result = execute_beside_a_person()
+    page = result.to_html(tmp_path / "page.html")
+    assert page.stat().st_size > 100_000
+    result.plot(tmp_path / "plot.png")
+    assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
+    assert isinstance(result.executed, vkc.Plan)

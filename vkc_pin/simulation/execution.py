@@ -10,7 +10,6 @@ import numpy as np
 from vkc_pin.errors import InputError
 from vkc_pin.simulation.contacts import Contact, find_unplanned_contacts
 from vkc_pin.simulation.friction import (
-    Span,
     find_fingers,
     find_grip_changes,
     insert_pauses,
@@ -28,7 +27,7 @@ from vkc_pin.simulation.stepping import (
     compute_commands,
     silence_warnings,
 )
-from vkc_pin.simulation.welds import find_hold_spans
+from vkc_pin.simulation.welds import Span, find_hold_spans
 from vkc_pin.utils.arguments import check_instance
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.scene.hold import Hold

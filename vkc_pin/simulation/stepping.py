@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from vkc_pin.simulation.contacts import Pairs, find_contact_pairs
-from vkc_pin.simulation.friction import Fingers, Span, Squeezes
+from vkc_pin.simulation.friction import Fingers, Squeezes
 from vkc_pin.simulation.model import Builder, PhysicalWorld
 from vkc_pin.simulation.physics import Physics, import_mujoco
 from vkc_pin.simulation.servos import Servo, compute_feedforward, sample_reference
-from vkc_pin.simulation.welds import Grips, Latches, find_latches
+from vkc_pin.simulation.welds import Grips, Latches, Span, find_latches
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.scene.clearance_exemptions import CONTACT_DEPTH
 from vkc_pin.world.scene.hold import Hold
@@ -153,6 +153,25 @@ class Stepper:
         self.data: Any = self._mj.MjData(model)
         self.data.qpos[:] = self.physical.to_qpos(tree.start)
         self._mj.mj_forward(model, self.data)
+
+    def adopt(self, other: Stepper) -> None:
+        """Take over the state of another model of the same scene, which has fewer holds.
+
+        Its holds are the first ones of this model.
+        """
+        old = other.physical.model
+        new = self.physical.model
+        mj = self._mj
+        for joint in range(old.njnt):
+            name = old.joint(joint).name
+            for field in ("qpos", "qvel", "qacc_warmstart"):
+                getattr(self.data.joint(name), field)[:] = getattr(other.data.joint(name), field)
+        first = len(other.grips.holds)
+        others = slice(len(self.grips.holds), None)
+        self.data.eq_active[others] = other.data.eq_active[first:]
+        self.grips.adopt(other.grips, self.data, other.data)
+        self.contact_samples = other.contact_samples
+        mj.mj_forward(new, self.data)
 
     @property
     def positions(self) -> Floats:

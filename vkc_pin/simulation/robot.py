@@ -226,6 +226,7 @@ class SimulatedRobot:
             if until > self.time:
                 self._pending = 0.0
                 self._advance(until)
+                self._check_stable()
 
     @property
     def rows(self) -> Floats:
@@ -308,6 +309,14 @@ class SimulatedRobot:
             passed = step_count * self._physics.timestep
             self._pending -= passed
             self._advance(self.time + passed)
+        self._check_stable()
+        try:
+            yield
+        finally:
+            self._left = time.perf_counter()
+
+    def _check_stable(self) -> None:
+        """Check that the integration has not diverged."""
         if self._diverged is not None:
             raise InputError(
                 "the integration diverged",
@@ -315,10 +324,6 @@ class SimulatedRobot:
                 expected="other physical settings",
                 got=f"diverged at {self._diverged:.2f} s",
             )
-        try:
-            yield
-        finally:
-            self._left = time.perf_counter()
 
     def _check_motion(self, motion: Trajectory) -> None:
         """Check that a motion is one of this robot, and holds objects of the scene."""
@@ -335,6 +340,9 @@ class SimulatedRobot:
             for hold in phase.holds:
                 check_choice(hold.object, objects, "object", "motion.phases")
                 objects[hold.object].object.attachment(hold.attachment)
+                if hold.by is not None:
+                    # raises an error if there is no such link
+                    objects[hold.by.object].link_placement(str(hold.link))
 
     def _make_stepper(self) -> Stepper:
         """Return the physics of the scene with welds for all holds so far."""

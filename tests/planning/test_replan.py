@@ -208,3 +208,19 @@ def test_only_a_success_is_planned_again_or_stopped() -> None:
     for call in (lambda: vkc.replan(failed, 0.0), lambda: failed.stop(0.0)):
         with pytest.raises(InputError, match="this plan is no success"):
             call()
+
+
+def test_door_that_is_elsewhere_in_the_hand_is_held_as_measured() -> None:
+    """The hand has closed a few millimetres beside the lever."""
+    plan = plan_door()
+    time = find_phase_begin(plan, "turn") + 0.2
+    at = plan.scene.objects["door"].placement
+    moved = pin.SE3(at.rotation, at.translation + np.array([0.004, -0.005, 0.0]))
+    scene = plan.scene_at(time).with_placement("door", moved)
+    found = vkc.replan(plan, time, scene=scene, time_limit=60.0)
+    assert found.success, found.summary()
+    (hold,) = found.scene.holds
+    assert np.linalg.norm(hold.deviation[:3]) == pytest.approx(0.0064, abs=1e-4)
+    far = pin.SE3(at.rotation, at.translation + np.array([0.1, 0.0, 0.0]))
+    with pytest.raises(InputError, match="100"):
+        vkc.replan(plan, time, scene=plan.scene_at(time).with_placement("door", far))

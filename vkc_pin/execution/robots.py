@@ -3,31 +3,15 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import check_instance, check_number
-from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.robot_state import RobotState as RobotState
 from vkc_pin.world.trajectory.trajectory import Trajectory
-
-
-@dataclass(frozen=True, eq=False)
-class RobotState:
-    """Measured state of a robot.
-
-    Attributes:
-        time: When it was measured, on the robot's clock [s].
-        positions: Coordinates of the robot, shape (n,), [m] and [rad].
-        velocities: Their velocities, shape (n,), [m/s] and [rad/s].
-    """
-
-    time: float
-    positions: Floats
-    velocities: Floats
 
 
 @runtime_checkable

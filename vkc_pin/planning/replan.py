@@ -45,7 +45,8 @@ def replan(
         velocity: Measured velocity of the robot, shape (n,), [m/s] and [rad/s], or coordinate →
             velocity. Default: the scene's.
         scene: The world as it is at that time: `plan.scene_at(time)`, changed by what was measured.
-            Default: that scene itself.
+            Default: that scene itself. If an object that the hand holds is elsewhere than planned,
+            its grasp counts as measured there.
         time_limit: Wall-clock limit [s]; see `plan`. If there is one, a failure is not explained,
             which may take longer.
         planner: Planner whose caches are used.
@@ -71,6 +72,7 @@ def replan(
         now = now.with_start(base=values[:3], arm=values[3:])
     if velocity is not None:
         now = now.with_start(velocity=velocity)
+    now = _measure_grasps(plan, now)
     motion = plan.trajectory
     rest = extract_times(motion, time, float(motion.times[-1]))
     prepared = prepare(now, steps, options=plan.options, terms=plan.terms, planner=planner)
@@ -89,6 +91,20 @@ def _check_scene(plan: Plan, scene: Scene) -> Scene:
         )
     for name in plan.scene.objects:
         check_choice(name, scene.objects, "object", "scene.objects")
+    return scene
+
+
+def _measure_grasps(plan: Plan, scene: Scene) -> Scene:
+    """Return a scene in which objects that are not where the plan has them are held as they are.
+
+    Raises:
+        InputError: An object is too far from where the hand holds it.
+    """
+    for hold in scene.holds:
+        planned = plan.scene.objects[hold.object].placement
+        is_fixed = not scene.objects[hold.object].object.free
+        if is_fixed and hold.by is None and scene.objects[hold.object].placement != planned:
+            scene = scene.with_measured_grasp(hold.object)
     return scene
 
 

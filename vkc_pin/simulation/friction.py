@@ -19,7 +19,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.simulation.model import Builder, PhysicalWorld, to_mujoco_quaternion
 from vkc_pin.simulation.physics import Physics, import_mujoco
 from vkc_pin.simulation.servos import Servo, make_servo
-from vkc_pin.simulation.welds import Grip, compute_planned_freedoms, measure_hand
+from vkc_pin.simulation.welds import Grip, Span, compute_planned_freedoms, measure_hand
 from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.world.models.gripper import PlacedShape, check_bar_fits, find_widest_bar
 from vkc_pin.world.models.shapes import triangulate
@@ -36,8 +36,6 @@ _INERTIA = 1e-4
 _REACH = 0.2
 # time constant [s] and damping ratio of the coupling of fingers
 _COUPLING = (0.004, 1.0)
-Span = tuple[Hold, float, float]
-"""A hold with its begin and end [s]."""
 # Fingers are commanded this fraction of their travel beyond the closed position, so that thin
 # objects are pressed too.
 _OVERTRAVEL = 0.15

@@ -30,6 +30,8 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 _AVERAGING_TIME = 0.02
 # [rad] or [m] from the latched position within which a latch engages
 _LATCH_TOLERANCE = 2e-3
+Span = tuple[Hold, float, float]
+"""A hold with its begin and end [s]."""
 # Rotational rows of a weld act on half angles, as quaternions do.
 _WELD_SCALES = (1.0, 1.0, 1.0, 0.5, 0.5, 0.5)
 
@@ -78,13 +80,32 @@ class Grip:
         return {**asdict(self), "missed": self.missed}
 
 
-def find_hold_spans(scene: Scene, trajectory: Trajectory) -> list[tuple[Hold, float, float]]:
+def find_hold_spans(scene: Scene, trajectory: Trajectory) -> list[Span]:
     """Return each hold that is not a push with its begin and end [s], ordered by begin."""
-    spans: list[tuple[Hold, float, float]] = []
-    begins: dict[Hold, float] = {}  # of holds that have not ended
     changes = [(-np.inf, set(scene.holds))]
     for phase in trajectory.phases:
         changes.append((float(trajectory.times[phase.first]), set(phase.holds)))
+    return _collect_spans(scene, changes)
+
+
+def find_nominal_spans(scene: Scene, motion: Trajectory) -> list[Span]:
+    """Return the holds of a motion's phases as `find_hold_spans` does, without deviations."""
+    changes: list[tuple[float, set[Hold]]] = []
+    for phase in motion.phases:
+        nominal = {hold.nominal for hold in phase.holds}
+        changes.append((float(motion.times[phase.first]), nominal))
+    return _collect_spans(scene, changes)
+
+
+def _collect_spans(scene: Scene, changes: Sequence[tuple[float, set[Hold]]]) -> list[Span]:
+    """Return each hold that is not a push with its begin and end [s].
+
+    Args:
+        scene: Scene of the holds.
+        changes: Times [s], each with all holds from then on.
+    """
+    spans: list[Span] = []
+    begins: dict[Hold, float] = {}  # of holds that have not ended
     for time, holds in changes:
         ended = [hold for hold in begins if hold not in holds]
         for hold in ended:
@@ -94,7 +115,33 @@ def find_hold_spans(scene: Scene, trajectory: Trajectory) -> list[tuple[Hold, fl
                 begins.setdefault(hold, time)
     for hold, begin in begins.items():
         spans.append((hold, begin, np.inf))
-    return sorted(spans, key=lambda span: (span[1], str(span[0])))
+    return sorted(spans, key=_get_order)
+
+
+def splice_spans(known: Sequence[Span], later: Sequence[Span], begin: float) -> list[Span]:
+    """Return the holds of two motions, of which the second one takes over.
+
+    A hold that both have at that time goes on, even if the hand has lost the object since.
+
+    Args:
+        known: Holds so far.
+        later: Holds of the second motion.
+        begin: Time at which it takes over [s].
+    """
+    spliced = [(hold, first, min(last, begin)) for hold, first, last in known if first < begin]
+    lasting = {hold: k for k, (hold, _, last) in enumerate(spliced) if last == begin}
+    for hold, first, last in later:
+        if first <= begin and hold in lasting:
+            number = lasting[hold]
+            spliced[number] = (hold, spliced[number][1], last)
+        else:
+            spliced.append((hold, max(first, begin), last))
+    return sorted(spliced, key=_get_order)
+
+
+def _get_order(span: Span) -> tuple[float, str]:
+    """Return what spans are sorted by: their begin [s], then their text."""
+    return span[1], str(span[0])
 
 
 def measure_hand(
@@ -156,7 +203,7 @@ class Grips:
         self,
         physical: PhysicalWorld,
         holds: Sequence[Hold],
-        schedule: Sequence[tuple[Hold, float, float]],
+        schedule: Sequence[Span],
         pairs: Pairs,
         trajectory: Trajectory,
         physics: Physics,
@@ -177,14 +224,60 @@ class Grips:
         self._targets: dict[Hold, pin.SE3] = {}  # of the welds: placement of link in holder
         self._equality = int(self._engine.mjtConstraint.mjCNSTR_EQUALITY)
         self._window = max(1, round(_AVERAGING_TIME / physics.timestep))
+        self._followed = -np.inf  # time up to which holds have begun [s]
 
     @property
     def has_active(self) -> bool:
         """Whether anything is welded."""
         return bool(self._active)
 
+    @property
+    def loads(self) -> dict[Hold, tuple[float, float]]:
+        """Active hold → force [N] and torque [N·m] at the grasping frame, averages of 20 ms."""
+        found: dict[Hold, tuple[float, float]] = {}
+        for hold in self._active:
+            forces = self._forces[hold]
+            mean = np.mean(forces, axis=0) if forces else np.zeros(6)
+            found[hold] = float(np.linalg.norm(mean[:3])), float(np.linalg.norm(mean[3:]))
+        return found
+
+    def reschedule(self, spans: Sequence[Span], last: float) -> None:
+        """Replace all begins and ends that are still to come; active holds stay as they are.
+
+        Args:
+            spans: All holds, including those that have begun, with begin and end [s].
+            last: Time at which the motion ends [s].
+        """
+        self.schedule = [span for span in spans if span[1] > self._followed]
+        begun = [span for span in spans if span[1] <= self._followed]
+        for hold, (number, _) in self._active.items():
+            end = max(end for other, _, end in begun if other == hold)
+            self._active[hold] = (number, end)
+            self.grips[number] = replace(self.grips[number], end=min(end, last))
+
+    def adopt(self, other: Grips, data: Any, other_data: Any) -> None:
+        """Go on with the welds of another model, whose holds are the first ones of this model.
+
+        Args:
+            other: Grips of the other model.
+            data: State of this model.
+            other_data: State of the other model.
+        """
+        count = len(other.holds)
+        model = self.physical.model
+        model.eq_data[:count] = other.physical.model.eq_data[:count]
+        data.eq_active[:count] = other_data.eq_active[:count]
+        self.grips = other.grips
+        self._active = other._active
+        self._forces = other._forces
+        self._targets = other._targets
+        self._followed = other._followed
+        for hold in self._active:
+            self._set_collision(hold, enabled=False)
+
     def follow(self, data: Any, clock: float) -> None:
         """Begin and end the holds that are due at a time [s] of the plan."""
+        self._followed = clock
         ended = [hold for hold, (_, end) in self._active.items() if end <= clock]
         for hold in ended:
             self._release(data, hold)

@@ -176,7 +176,7 @@ class World:
         gripper = self.scene.robot.gripper
         if gripper is not None:
             first = len(self.scene.start)
-            rows[:, first : first + len(gripper.names)] = _compute_finger_positions(
+            rows[:, first : first + len(gripper.names)] = compute_finger_positions(
                 gripper, compute_start_opening(self.scene), trajectory, times
             )
         return rows
@@ -197,13 +197,19 @@ class World:
         return slice(first, first + 7)
 
 
-def _compute_finger_positions(
+def compute_finger_positions(
     gripper: Gripper, start: float | None, trajectory: Trajectory, times: Floats
 ) -> Floats:
     """Compute finger positions along a motion, shape (K, k), [m] or [rad].
 
     Fingers move to the opening of a phase between its first two waypoints. In the first phase they
     have that opening from the start, unless the robot rests there.
+
+    Args:
+        gripper: The gripper.
+        start: Its opening before the motion [m]; None: as in the robot's rest configuration.
+        trajectory: The motion.
+        times: Times, shape (K,) [s].
     """
     robot = trajectory.positions[:, : trajectory.robot_size]
     is_resting_first = np.array_equal(robot[0], robot[1])

@@ -49,8 +49,9 @@ from vkc_pin.world.trajectory.wheels import make_rolling_limits
 # regularises the problem.
 _CHOSEN_FREEDOM_WEIGHT = 1e-4
 _TOLERANCES = Tolerances()
-# [m/s], [rad/s] with which a start velocity may open the closure of a grasped object
-_MAX_CLOSURE_SPEED = 1e-3
+# [m/s], [rad/s] with which a start velocity may open the closure of a grasped object, as where it
+# is not exactly where the motion was planned. At 1 m/s², such a hand is brought back within 0.5 mm.
+_MAX_CLOSURE_SPEED = 0.03
 
 
 class TrajectoryProblem:

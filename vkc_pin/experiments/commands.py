@@ -29,6 +29,7 @@ def add_bench(commands: Any) -> None:
     _add_comparisons(benches)
     _add_chores(benches)
     _add_execution(benches)
+    _add_closed_loop(benches)
 
 
 def _add_door(benches: Any) -> None:
@@ -97,6 +98,17 @@ def _add_execution(benches: Any) -> None:
     parser.add_argument("--grasp", default="weld", metavar="MODEL", help=about)
     about = "execute and measure the grasp, displace the hand by MM, and plan the rest from there"
     parser.add_argument("--off", nargs="+", type=float, default=[], metavar="MM", help=about)
+
+
+def _add_closed_loop(benches: Any) -> None:
+    about = "execute plans in MuJoCo while the world differs from them (needs the extra `sim`)"
+    module = "vkc_pin.experiments.closed_loop"
+    parser = add_experiment(benches, "closed-loop", about, module=module)
+    add_count(parser, "--trials", 20, "random starts per row and task")
+    tasks = "door corridor_door drawer household_refrigerator household_cabinet household_cup"
+    add_choice(parser, "tasks", f"{tasks} (default: all)")
+    rows = "nothing displaced obstacle person localisation grasp"
+    add_choice(parser, "rows", f"{rows} (default: all)")
 
 
 def add_experiment(

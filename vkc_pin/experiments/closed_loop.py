@@ -1,0 +1,418 @@
+"""Executes plans in physics while the world differs from what was planned, open and closed loop."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Unpack
+
+import coal
+import numpy as np
+import pinocchio as pin
+
+from vkc_pin.errors import InputError
+from vkc_pin.execution import ExecutionResult, SimulatedRobot, execute
+from vkc_pin.experiments.harness import runner
+from vkc_pin.experiments.harness.record import Record, trial, values
+from vkc_pin.experiments.harness.runner import LIMITS, Execution, describe_limit
+from vkc_pin.experiments.harness.tables import count, format_table, join_sections, select
+from vkc_pin.experiments.tasks import TASKS as ALL
+from vkc_pin.experiments.tasks import make_start
+from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.prepare import plan
+from vkc_pin.simulation.physics import import_mujoco
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.steps import Actuate, Place
+from vkc_pin.world.trajectory.world_model import World
+
+TASKS = (
+    "door",
+    "corridor_door",
+    "drawer",
+    "household_refrigerator",
+    "household_cabinet",
+    "household_cup",
+)
+"""Tasks that are executed."""
+
+ROWS: Mapping[str, str] = {
+    "nothing": "the world is as planned",
+    "displaced": "the object is up to 50 mm and 5° elsewhere, which is noticed at 1 m",
+    "obstacle": "something appears on the path of the base",
+    "person": "a person crosses the path of the base at 0.5 to 1 m/s",
+    "localisation": "the base is localised 20 mm and 1° off, and drifts by 5 mm/m and 0.2°/m",
+    "grasp": "the hand closes up to 8 mm and 3° off, which is noticed then",
+}
+"""Name of a row of the table → what differs from the plan."""
+
+_PERSON = "person"
+_WIDTH = 0.2  # [m], radius of a person and of what appears
+_HEIGHT = 1.6  # [m]
+_AWAY = -5.0  # [m], height at which an obstacle is out of the way, below the floor
+_NOTICE = 1.0  # [m] from the hand to its grasp at which an object is seen
+_PERIOD = 0.01  # [s] of the robot's record
+_MOVING = 0.02  # [m/s] or [rad/s]; slower, a robot stands, and who walks into it does so himself
+_REACHED = {"m": 0.01, "rad": 0.02}  # accepted miss of a goal, as in `execution`
+_DEEPEST = 1e-3  # [m] of collisions that count as none
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """What differs from the plan.
+
+    Attributes:
+        actual: The scene as it really is, at the start.
+        observe: What is known at present: (scene, robot's clock [s], hand's place) → scene.
+        obstacle: Time [s] → centre of the moving obstacle, shape (3,); None without one.
+        offset, drift: See `SimulatedRobot`.
+    """
+
+    actual: Scene
+    observe: Callable[[Scene, float, Floats], Scene]
+    obstacle: Callable[[float], Floats] | None = None
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    drift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+def run(
+    *,
+    out: str | Path,
+    trials: int = 20,
+    seed: int = 0,
+    tasks: Sequence[str] | None = None,
+    rows: Sequence[str] | None = None,
+    **execution: Unpack[Execution],
+) -> dict[str, Any]:
+    """Run the experiment in the folder `out`; see `runner.run`.
+
+    Args:
+        out: Folder.
+        trials: Number of random starts per task and row, at least 1.
+        seed: Random seed of starts, planning and differences.
+        tasks: Some of `TASKS`. Default: all.
+        rows: Some of `ROWS`. Default: all.
+    """
+    import_mujoco()
+    runner.check_positive(trials=trials)
+    names = runner.select_names("task", TASKS if tasks is None else tasks, TASKS)
+    kinds = runner.select_names("row", tuple(ROWS) if rows is None else rows, tuple(ROWS))
+    settings = {
+        "benchmark": "closed-loop",
+        "seed": seed,
+        "starts": trials,
+        "tasks": names,
+        "rows": kinds,
+        "mujoco": version("mujoco"),
+        **LIMITS,
+    }
+    specs = []
+    for row, name, number in itertools.product(kinds, names, range(trials)):
+        key = f"{list(ROWS).index(row)}/{TASKS.index(name)}/{number:04d}"
+        specs.append({"key": key, "row": row, "task": name, "number": number, "seed": seed})
+    return runner.run(
+        specs, _record, out, settings=settings, format_results=format_results, **execution
+    )
+
+
+def format_results(result: Mapping[str, Any]) -> str:
+    """Return the tables of a result in Markdown."""
+    about = result["meta"]
+    records = result["trials"]
+    head = ["row", "task", "plans", "open", "closed", "deepest [mm]", "latency [ms]", "cycles [%]"]
+    rows = []
+    for row, name in itertools.product(about["rows"], about["tasks"]):
+        rows.append([row, name, *_summarize(select(records, row=row, task=name))])
+    for row in about["rows"]:
+        rows.append([row, "all", *_summarize(select(records, row=row))])
+    lines = ["## Trials that failed in the closed loop", ""]
+    for record in records:
+        if record["success"] and not record.get("closed"):
+            where = f"{record['row']}, {record['task']}, start {record['number']}"
+            lines.append(f"- {where}, seed {record['seed']}: {record['closed_reason']}")
+    return join_sections(
+        about,
+        "# Plans in a world that differs",
+        f"{about['starts']} random starts per row and task, seed {about['seed']}, "
+        f"{describe_limit(about)} each. Robots in physics are judged by what they really did: "
+        "goals within 10 mm and 0.02 rad, grasps that last, and no collision deeper than 1 mm with what "
+        "was not meant to be touched, while they move. Time passes for the robot while the program "
+        "computes. Latencies are the median and the 95th percentile of cycles that planned again; "
+        "cycles are those that kept 20 Hz.",
+        "\n".join(f"- {row}: {ROWS[row]}" for row in about["rows"]),
+        format_table(head, rows),
+        "\n".join(lines),
+    )
+
+
+def _summarize(records: Sequence[Record]) -> list[str]:
+    planned = select(records, success=True)
+    latencies = [1e3 * value for record in planned for value in record["latencies"]]
+    deepest = values(planned, "closed_depth")
+    cycles = sum(record["cycles"] for record in planned)
+    late = sum(record["late"] for record in planned)
+    middle = "–"
+    if latencies:
+        middle = f"{np.median(latencies):.0f}, {np.quantile(latencies, 0.95):.0f}"
+    return [
+        count(records),
+        count(planned, "open"),
+        count(planned, "closed"),
+        f"{1e3 * max(deepest):.1f}" if deepest else "–",
+        middle,
+        f"{100.0 * (1.0 - late / cycles):.1f}" if cycles else "–",
+    ]
+
+
+def _record(spec: dict[str, Any]) -> dict[str, Any]:
+    """Plan and execute a trial, open and closed loop, and return its record."""
+    seed, row = spec["seed"], spec["row"]
+    rng = np.random.default_rng([seed, list(ROWS).index(row), spec["number"]])
+    start = _add_person(make_start(spec["task"], seed, spec["number"]))
+    found = plan(start, ALL[spec["task"]].steps, seed=seed, **LIMITS)
+    fields: dict[str, Any] = {"row": row, "task": spec["task"], "number": spec["number"]}
+    if not found.success:
+        return trial(found, method="VKC", seed=seed, **fields)
+    disturbance = _disturb(row, found, rng)
+    robot = _make_robot(found, disturbance, spec)
+    robot.send(found.trajectory, 0.05)
+    robot.wait(0.05 + float(found.trajectory.times[-1]) + 1.0)
+    fields |= _judge("open", found, robot, disturbance)
+
+    robot = _make_robot(found, disturbance, spec)
+
+    def observe(scene: Scene) -> Scene:
+        hand = scene.with_start(base=robot.read().positions[:3], arm=robot.read().positions[3:])
+        return disturbance.observe(scene, robot.time, hand.tool_placement().translation)
+
+    result = execute(found, robot, observe=observe)
+    robot.wait(robot.time + 1.0)
+    fields |= _judge("closed", found, robot, disturbance, result)
+    fields |= {
+        "decisions": result.count_decisions(),
+        "latencies": result.latencies.get("replan", []),
+        "cycles": len(result.cycles),
+        "late": result.late,
+    }
+    return trial(found, method="VKC", seed=seed, duration=found.metrics["duration"], **fields)
+
+
+def _make_robot(found: Plan, disturbance: Disturbance, spec: Mapping[str, Any]) -> SimulatedRobot:
+    return SimulatedRobot(
+        found.scene,
+        actual=disturbance.actual,
+        seed=spec["seed"],
+        base_offset=disturbance.offset,
+        base_drift=disturbance.drift,
+    )
+
+
+def _add_person(scene: Scene) -> Scene:
+    """Return a scene with a cylinder that is out of the way, below the floor."""
+    person = {
+        "name": _PERSON,
+        "type": "cylinder",
+        "radius": _WIDTH,
+        "length": _HEIGHT,
+        "position": [0.0, 0.0, _AWAY],
+    }
+    document = dict(scene.document)
+    document["obstacles"] = [*document.get("obstacles", []), person]
+    return Scene.from_document(document, scene.folder)
+
+
+def _disturb(row: str, found: Plan, rng: np.random.Generator) -> Disturbance:
+    """Return what differs from a plan in a row of the table."""
+    scene = found.scene
+    step = found.steps[0]
+    assert isinstance(step, Actuate | Place)
+    name = step.object
+    closing = float(found.trajectory.times[found.trajectory.phases[0].last])
+    at_grasp = found.pose(None, closing).translation
+    if row in ("displaced", "grasp"):
+        largest, turn = (0.05, 5.0) if row == "displaced" else (0.008, 3.0)
+        actual = _displace(scene, name, largest, np.radians(turn), rng)
+        placement = actual.objects[name].placement
+
+        def see(known: Scene, clock: float, hand: Floats) -> Scene:
+            is_seen = float(np.linalg.norm(hand - at_grasp)) < _NOTICE
+            if row == "grasp":
+                is_seen = clock > closing + found.options.grasp_time
+            is_free = name not in known.held or not known.objects[name].object.free
+            return known.with_placement(name, placement) if is_seen and is_free else known
+
+        return Disturbance(actual, see)
+    if row == "localisation":
+        angle = rng.uniform(0.0, 2.0 * np.pi)
+        signs = rng.choice([-1.0, 1.0], 2)
+        offset = (0.02 * np.cos(angle), 0.02 * np.sin(angle), np.radians(1.0) * signs[0])
+        drift = (0.005 * np.cos(angle), 0.005 * np.sin(angle), np.radians(0.2) * signs[1])
+        return _mislocalise(found, name, offset, drift, at_grasp)
+    if row == "nothing":
+        return Disturbance(scene, lambda known, clock, hand: known)
+    return _obstruct(row, found, closing, rng)
+
+
+def _displace(
+    scene: Scene, name: str, largest: float, turn: float, rng: np.random.Generator
+) -> Scene:
+    """Return a scene with an object elsewhere by up to a distance [m] and an angle [rad]."""
+    at = scene.objects[name].placement
+    angle, direction = rng.uniform(-turn, turn), rng.uniform(0.0, 2.0 * np.pi)
+    distance = largest * rng.uniform()
+    shift = distance * np.array([np.cos(direction), np.sin(direction), 0.0])
+    rotation = pin.utils.rotate("z", angle) @ at.rotation
+    return scene.with_placement(name, pin.SE3(rotation, at.translation + shift))
+
+
+def _mislocalise(
+    found: Plan,
+    name: str,
+    offset: tuple[float, float, float],
+    drift: tuple[float, float, float],
+    at_grasp: Floats,
+) -> Disturbance:
+    """Return a bias of the base's localisation.
+
+    A camera sees the object where it is relative to the robot, which believes to be at q + b when
+    it is at q: in its frame, the object is moved by the bias b.
+    """
+    at = found.scene.objects[name].placement
+    start = found.scene.start[:2]
+
+    def see(known: Scene, clock: float, hand: Floats) -> Scene:
+        is_free = name not in known.held or not known.objects[name].object.free
+        if np.linalg.norm(hand - at_grasp) > _NOTICE or not is_free:
+            return known
+        base = known.start[:3]
+        travelled = float(np.linalg.norm(base[:2] - start))
+        bias = np.array(offset) + np.array(drift) * travelled
+        turn = pin.SE3(pin.utils.rotate("z", bias[2]), np.zeros(3))
+        about = pin.SE3(np.eye(3), np.array([base[0] - bias[0], base[1] - bias[1], 0.0]))
+        shift = pin.SE3(np.eye(3), np.array([bias[0], bias[1], 0.0]))
+        moved = shift * about * turn * about.inverse()
+        return known.with_placement(name, moved * at)
+
+    return Disturbance(found.scene, see, offset=offset, drift=drift)
+
+
+def _obstruct(row: str, found: Plan, closing: float, rng: np.random.Generator) -> Disturbance:
+    """Return something that appears on the base's path, or somebody who crosses it."""
+    motion = found.trajectory
+    moment = closing * rng.uniform(0.4, 0.7)  # when the base would be there
+    place = motion.at(moment)[:2]
+    velocity = motion.velocity(moment)[:2]
+    along = velocity / max(float(np.linalg.norm(velocity)), 1e-9)
+    across = np.array([-along[1], along[0]])
+    if row == "obstacle":
+        place = place + across * rng.uniform(-0.4, 0.4)
+        appears = 0.3 * moment
+
+        def stand(clock: float) -> Floats:
+            height = _HEIGHT / 2 if clock >= appears else _AWAY
+            return np.array([*place, height])
+
+        return Disturbance(found.scene, _see_obstacle(stand), stand)
+    speed = rng.uniform(0.5, 1.0) * rng.choice([-1.0, 1.0])
+    crosses = moment + rng.uniform(-0.5, 0.5)
+
+    def walk(clock: float) -> Floats:
+        return np.array([*(place + across * speed * (clock - crosses)), _HEIGHT / 2])
+
+    return Disturbance(found.scene, _see_obstacle(walk), walk)
+
+
+def _see_obstacle(obstacle: Callable[[float], Floats]) -> Callable[[Scene, float, Floats], Scene]:
+    def see(known: Scene, clock: float, hand: Floats) -> Scene:
+        return known.with_obstacle(_PERSON, [*obstacle(clock), 0.0, 0.0, 0.0])
+
+    return see
+
+
+def _judge(
+    loop: str,
+    found: Plan,
+    robot: SimulatedRobot,
+    disturbance: Disturbance,
+    result: ExecutionResult | None = None,
+) -> dict[str, Any]:
+    """Return what a robot really did."""
+    reasons = []
+    if result is not None and not result.success:
+        reasons.append(result.reason)
+    reasons += _find_misses(found, robot)
+    reasons += [f"{grip.what} was lost" for grip in robot.grips if grip.missed]
+    depth = 0.0
+    contacts = robot.contacts(disturbance.actual)
+    depth = max([depth, *(contact.depth for contact in contacts)])
+    if disturbance.obstacle is not None:
+        depth = max(depth, _measure_depth(found.scene, robot, disturbance.obstacle))
+    if depth > _DEEPEST:
+        reasons.append(f"collides by {1e3 * depth:.1f} mm")
+    return {
+        loop: not reasons,
+        f"{loop}_reason": "; ".join(reasons),
+        f"{loop}_depth": depth,
+        f"{loop}_force": max((grip.force for grip in robot.grips), default=0.0),
+    }
+
+
+def _find_misses(found: Plan, robot: SimulatedRobot) -> list[str]:
+    """Return by how much the goals of a task's only step are missed, where they are."""
+    step = found.steps[0]
+    states = robot.object_states()
+    missed = []
+    if isinstance(step, Actuate):
+        item = found.scene.objects[step.object].object
+        for joint, value in step.joints.items():
+            unit = item.coordinates.units[item.coordinates.index(joint)]
+            miss = abs(states[step.object].joints[joint] - value)
+            if miss > _REACHED[unit]:
+                missed.append(f"{step.object}.{joint} misses its goal by {miss:.3g} {unit}")
+    elif isinstance(step, Place):
+        goal = found.end_scene().objects[step.object].placement
+        there = states[step.object].placement
+        miss = float(np.linalg.norm(there.translation - goal.translation))
+        if miss > _REACHED["m"]:
+            missed.append(f"{step.object} misses its place by {miss:.3g} m")
+    else:
+        raise InputError("cannot be judged", field="steps", got=repr(step))
+    return missed
+
+
+def _measure_depth(
+    scene: Scene, robot: SimulatedRobot, obstacle: Callable[[float], Floats]
+) -> float:
+    """Return how deep the robot, while it moved, was in a moving cylinder [m]."""
+    world = World(scene)
+    data = world.model.createData()
+    size = len(scene.robot.collision.geometryObjects)
+    solid = coal.Cylinder(_WIDTH, _HEIGHT)
+    request, answer = coal.DistanceRequest(), coal.DistanceResult()
+    request.enable_signed_distance = True
+    rows = robot.rows
+    deepest = 0.0
+    for number in range(1, len(rows)):
+        speed = np.abs(rows[number] - rows[number - 1])[: len(scene.start)].max() / _PERIOD
+        if speed < _MOVING:
+            continue
+        centre = obstacle(number * _PERIOD)
+        pin.forwardKinematics(world.model, data, world.coordinates.q(rows[number]))
+        for shape in world.shapes[:size]:
+            placement = data.oMi[shape.parentJoint] * shape.placement
+            if np.linalg.norm(placement.translation[:2] - centre[:2]) > 1.5:
+                continue
+            answer.clear()
+            distance = coal.distance(
+                shape.geometry,
+                coal.Transform3s(placement.rotation, placement.translation),
+                solid,
+                coal.Transform3s(np.eye(3), centre),
+                request,
+                answer,
+            )
+            deepest = max(deepest, -distance)
+    return deepest

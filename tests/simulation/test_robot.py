@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.drawers import add_boxes
 from helpers.executions import (
     make_grasping_scene,
     make_stationary_motion,
@@ -165,6 +166,43 @@ def test_robot_stops_where_it_is() -> None:
     assert after.positions[0] == pytest.approx(before.positions[0], abs=0.01)
     robot.wait(4.0)
     np.testing.assert_allclose(robot.read().positions, after.positions, atol=1e-4)
+
+
+def test_object_stays_in_the_hand_when_the_robot_stops_while_it_closes() -> None:
+    """The fingers close while the robot rests, between the first two waypoints of the phase."""
+    held = make_grasping_scene()
+    still = make_stationary_motion(held)
+    (phase,) = still.phases
+    waiting = dataclasses.replace(phase, holds=(), last=1)
+    closing = dataclasses.replace(phase, first=1, last=2, opening=0.02)
+    motion = dataclasses.replace(
+        still,
+        times=np.array([0.0, 0.01, 1.01]),
+        positions=still.positions[[0, 0, 0]],
+        phases=(waiting, closing),
+    )
+    robot = make_robot(held.with_held({}), physics=vkc.Physics(settle=0.0))
+    robot.send(motion, 0.0)
+    robot.wait(0.5)
+    robot.stop()
+    robot.wait(0.8)
+    (grip,) = robot.grips
+    assert grip.end > 0.8
+    assert robot.grasped_poses[-1].time > 0.75
+
+
+def test_robot_is_off_its_motion_at_an_obstacle_that_was_not_planned() -> None:
+    scene = vkc.load_scene("door")
+    x, y = scene.start[:2].tolist()
+    actual = add_boxes(scene, crate=((0.3, 0.3, 0.4), (x + 0.8, y, 0.2)))
+    robot = make_robot(scene, actual=actual)
+    robot.send(make_drive(scene, 0.6, 1.0), 0.1)
+    robot.wait(2.0)
+    assert robot.read().positions[0] < x + 0.5
+    (contact,) = robot.contacts()
+    assert "crate" in (contact.first, contact.second)
+    assert 0.1 < contact.begin < 2.0
+    assert contact.depth > 1e-5
 
 
 def test_later_motion_takes_over_and_earlier_one_goes_on_until_then() -> None:

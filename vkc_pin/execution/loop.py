@@ -6,15 +6,16 @@ import time
 from collections.abc import Callable
 
 from vkc_pin.errors import InputError, format_value
-from vkc_pin.execution.monitor import Finding, Monitor
+from vkc_pin.execution.monitor import Monitor
 from vkc_pin.execution.record import Cycle, Decision, ExecutionResult
 from vkc_pin.execution.robots import Robot, RobotState
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner
 from vkc_pin.planning.prepare import prepare
-from vkc_pin.planning.replan import find_remaining_steps, replan
+from vkc_pin.planning.replan import find_remaining_steps, measure_grasps, replan
 from vkc_pin.planning.stopping import brake
 from vkc_pin.utils.arguments import check_instance, check_number
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Step
 from vkc_pin.world.trajectory.trajectory import Trajectory
@@ -112,29 +113,30 @@ class _Loop:
     def run(self) -> ExecutionResult:
         state = self._robot.read()
         monitor = Monitor(self._first, tracking=self._tracking)
-        finding = monitor.check(float(self._first.trajectory.times[0]), state, None)
-        if finding.reason:
+        finding = monitor.check_tracking(float(self._first.trajectory.times[0]), state)
+        if finding:
             expected = "a robot at the start of the plan"
-            raise InputError(
-                "not at its start", field="robot", expected=expected, got=finding.reason
-            )
-        self._send(self._first, state.time + self._period)
-        next_cycle = state.time + self._period
+            raise InputError("not at its start", field="robot", expected=expected, got=finding)
+        begin = self._robot.time + self._period
+        self._robot.send(self._first.trajectory, begin)
+        self._sent.append((begin, self._first))
+        self._monitor = monitor
+        next_cycle = begin
         reason = ""
         while not reason:
             self._robot.wait(next_cycle)
-            state = self._robot.read()
+            now = self._robot.time
             began = time.perf_counter()
-            motion_time = self._get_motion_time(state.time)
-            decision, why = self._decide(state)
+            motion_time = self._get_motion_time(now)
+            decision, why = self._decide(now, self._robot.read())
             latency = time.perf_counter() - began
-            self._cycles.append(Cycle(state.time, motion_time, latency, decision, why))
+            self._cycles.append(Cycle(now, motion_time, latency, decision, why))
             self._late += latency > self._period
             if decision == "stop":
                 reason = why
-            elif self._is_done(state.time):
+            elif self._is_done(now):
                 break
-            next_cycle = max(next_cycle + self._period, state.time)
+            next_cycle = max(next_cycle + self._period, self._robot.time)
         return ExecutionResult(
             self._first, not reason, reason, tuple(self._cycles), tuple(self._sent), self._late
         )
@@ -153,80 +155,111 @@ class _Loop:
         begin, plan = self._sent[-1]
         return self._waiting is None and now - begin >= float(plan.trajectory.times[-1])
 
-    def _send(self, plan: Plan, begin: float) -> None:
+    def _send(self, plan: Plan, begin: float) -> bool:
+        """Send a plan's motion; return whether it is not too late for that."""
+        monitor = Monitor(plan, tracking=self._tracking)
+        if self._robot.time >= begin:
+            return False
         self._robot.send(plan.trajectory, begin)
         self._sent.append((begin, plan))
-        self._monitor = Monitor(plan, tracking=self._tracking)
+        self._monitor = monitor
+        return True
 
     def _look(self, scene: Scene) -> Scene:
         """Return a scene with what is known at present."""
         return scene if self._observe is None else self._observe(scene)
 
-    def _decide(self, state: RobotState) -> tuple[Decision, str]:
+    def _decide(self, now: float, state: RobotState) -> tuple[Decision, str]:
         begin, plan = self._sent[-1]
         if self._waiting is not None:
-            return self._plan_from_rest(state, self._waiting)
-        if state.time < begin:
+            return self._plan_from_rest(now, self._waiting)
+        if min(now, state.time) < begin:
             return "go on", ""  # a motion has been sent that has not begun
-        now = self._get_motion_time(state.time)
         scene = None if self._observe is None else self._look(plan.scene)
-        finding = self._monitor.check(now, state, scene)
-        if not finding.reason:
+        finding = self._monitor.check_world(self._get_motion_time(now), scene)
+        error = None
+        if not finding:
+            measured = self._get_motion_time(state.time)
+            finding = self._monitor.check_tracking(measured, state)
+            planned = plan.trajectory.at(measured)[: plan.trajectory.robot_size]
+            error = state.positions - planned
+        if not finding:
             return "go on", ""
-        return self._react(state, now, finding)
+        return self._react(now, finding, error)
 
-    def _react(self, state: RobotState, now: float, finding: Finding) -> tuple[Decision, str]:
-        """Plan the rest again, or brake."""
+    def _react(self, now: float, finding: str, error: Floats | None) -> tuple[Decision, str]:
+        """Plan the rest again, or brake.
+
+        Args:
+            now: Time of the robot's clock [s].
+            finding: Why.
+            error: Distance of the robot from its motion, shape (n,), if that is why.
+        """
         plan = self._plan
-        takeover = now + self._lead
+        takeover = self._get_motion_time(now) + self._lead
         if takeover < float(plan.trajectory.times[-1]):
-            scene = self._look(plan.scene_at(takeover))
             try:
+                scene = self._look(plan.scene_at(takeover))
+                state = None if error is None else scene.start + error
                 found = replan(
-                    plan, takeover, scene=scene, time_limit=self._time_limit, planner=self._planner
+                    plan,
+                    takeover,
+                    state=state,
+                    scene=scene,
+                    time_limit=self._time_limit,
+                    planner=self._planner,
                 )
-            except InputError as error:  # the steps are impossible there
-                return self._brake(now, f"{finding.reason}; {error}")
-            at = state.time + self._lead
-            if found.success and self._robot.read().time < at:
-                self._send(found, at)
-                return "replan", finding.reason
-            finding = Finding(f"{finding.reason}; {found.status}", finding.time)
-        return self._brake(now, finding.reason)
+            except InputError as impossible:  # the steps are, there
+                return self._brake(f"{finding}; {impossible}")
+            if found.success and self._send(found, now + self._lead):
+                return "replan", finding
+            finding = f"{finding}; {'too late' if found.success else found.status}"
+        return self._brake(finding)
 
-    def _brake(self, now: float, reason: str) -> tuple[Decision, str]:
-        """Send a braking motion on the path."""
+    def _brake(self, reason: str) -> tuple[Decision, str]:
+        """Send a braking motion on the path.
+
+        Whatever will be touched, nothing is better than to brake: it is sent unchecked.
+        """
         plan = self._plan
-        clock = self._robot.read().time + _BRAKE_DELAY
-        motion_time = self._get_motion_time(clock)
+        delay = _BRAKE_DELAY
+        while True:
+            begin = self._robot.time + delay
+            motion_time = self._get_motion_time(begin)
+            motion = brake(plan.scene, plan.trajectory, motion_time, plan.options)
+            if self._robot.time < begin:
+                break
+            delay *= 2.0  # on a slow machine
+        self._robot.send(motion, begin)
         try:
             steps = find_remaining_steps(plan, motion_time)
         except InputError:
             return "stop", reason
-        # Whatever will be touched, nothing is better than to brake: it is sent unchecked.
-        motion = brake(plan.scene, plan.trajectory, motion_time, plan.options)
-        self._robot.send(motion, clock)
         self._waiting = (steps, plan.trajectory)
         stop = plan.stop(motion_time, scene=self._look(plan.scene_at(motion_time)))
-        self._sent.append((clock, stop))
-        self._rest_since = clock + float(motion.times[-1])
+        self._sent.append((begin, stop))
+        self._rest_since = begin + float(motion.times[-1])
         return "brake", reason
 
     def _plan_from_rest(
-        self, state: RobotState, waiting: tuple[tuple[Step, ...], Trajectory]
+        self, now: float, waiting: tuple[tuple[Step, ...], Trajectory]
     ) -> tuple[Decision, str]:
         """Plan the remaining steps from where the robot stands, once it does."""
-        if state.time < self._rest_since:
+        if now < self._rest_since:
             return "wait", "braking"
         steps, guess = waiting
-        if state.time > self._rest_since + self._patience:
+        if now > self._rest_since + self._patience:
             return "stop", "no motion was found from rest"
         end = float(self._plan.trajectory.times[-1])
-        scene = self._look(self._plan.scene_at(end))
-        prepared = prepare(scene, steps, options=self._first.options, planner=self._planner)
+        try:
+            scene = measure_grasps(self._look(self._plan.scene_at(end)))
+            prepared = prepare(scene, steps, options=self._first.options, planner=self._planner)
+        except InputError as impossible:
+            return "wait", str(impossible)
         found = prepared.solve(guess=guess, time_limit=max(self._time_limit, 1.0), explain=False)
         if not found.success:
             return "wait", found.status
+        if not self._send(found, self._robot.time + self._period):
+            return "wait", "too late"
         self._waiting = None
-        self._send(found, self._robot.read().time + _BRAKE_DELAY)
         return "replan", "from rest"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 import pinocchio as pin
 
@@ -11,25 +9,11 @@ from vkc_pin.execution.robots import RobotState
 from vkc_pin.planning.plan import Plan
 from vkc_pin.utils.arguments import check_number
 from vkc_pin.validation.remaining import RemainingCheck
-from vkc_pin.validation.report import Violation
 from vkc_pin.world.scene.scene import Scene
 
 # Displacement of an object from which on the motion to it is planned again [m], [rad]: what
 # validation accepts at a grasp.
 _OBJECT_TOLERANCES = (1e-3, 2e-3)
-
-
-@dataclass(frozen=True)
-class Finding:
-    """What a monitor found.
-
-    Attributes:
-        reason: Why the motion cannot go on as planned; "" if it can.
-        time: Earliest time of the motion at which something would be touched [s]; inf: never.
-    """
-
-    reason: str = ""
-    time: float = np.inf
 
 
 class Monitor:
@@ -47,25 +31,32 @@ class Monitor:
         self.tracking = check_number(tracking, "tracking", low=0.0, strict=True)
         self._check = RemainingCheck(plan.scene, plan.steps, plan.trajectory, plan.options)
 
-    def check(self, time: float, state: RobotState | None, scene: Scene | None) -> Finding:
-        """Check the motion from a time on.
+    def check_world(self, time: float, scene: Scene | None) -> str:
+        """Return why the world does not let the motion go on as planned; "" if it does.
 
         Args:
             time: Time of the motion [s].
-            state: Measured state of the robot; None: not measured.
             scene: The plan's scene with what was measured since: placements of objects and of
                 obstacles. None: nothing was.
         """
-        if scene is not None:
-            moved = self._find_moved_object(scene)
-            if moved:
-                return Finding(f"{moved} is elsewhere")
-            violations = self._check.find_violations(scene, time)
-            if violations:
-                return Finding(str(violations[0].subject), _find_first_time(violations))
-        if state is not None:
-            return self._check_tracking(time, state)
-        return Finding()
+        if scene is None:
+            return ""
+        moved = self._find_moved_object(scene)
+        if moved:
+            return f"{moved} is elsewhere"
+        violations = self._check.find_violations(scene, time)
+        return violations[0].subject if violations else ""
+
+    def check_tracking(self, time: float, state: RobotState) -> str:
+        """Return how the robot is off its motion at a time of the motion [s]; "" if it is not."""
+        motion = self.plan.trajectory
+        errors = np.abs(state.positions - motion.at(time)[: motion.robot_size])
+        worst = int(np.argmax(errors))
+        if errors[worst] <= self.tracking:
+            return ""
+        coordinates = self.plan.scene.robot.coordinates
+        unit = coordinates.units[worst]
+        return f"{coordinates.names[worst]} is {errors[worst]:.3g} {unit} off"
 
     def _find_moved_object(self, scene: Scene) -> str:
         """Return the name of an object that is not where the plan has it; "" if all are."""
@@ -76,18 +67,3 @@ class Monitor:
             if distance > _OBJECT_TOLERANCES[0] or angle > _OBJECT_TOLERANCES[1]:
                 return name
         return ""
-
-    def _check_tracking(self, time: float, state: RobotState) -> Finding:
-        motion = self.plan.trajectory
-        planned = motion.at(time)[: motion.robot_size]
-        errors = np.abs(state.positions - planned)
-        worst = int(np.argmax(errors))
-        if errors[worst] <= self.tracking:
-            return Finding()
-        coordinates = self.plan.scene.robot.coordinates
-        unit = coordinates.units[worst]
-        return Finding(f"{coordinates.names[worst]} is {errors[worst]:.3g} {unit} off")
-
-
-def _find_first_time(violations: tuple[Violation, ...]) -> float:
-    return min(violation.time for violation in violations)

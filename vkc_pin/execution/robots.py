@@ -18,6 +18,10 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 class Robot(Protocol):
     """A robot, or its driver, as the closed loop sees it. All times are those of its clock [s]."""
 
+    @property
+    def time(self) -> float:
+        """The time now."""
+
     def read(self) -> RobotState:
         """Return the state as it was measured last."""
 

@@ -66,7 +66,8 @@ class Disturbance:
 
     Attributes:
         actual: The scene as it really is, at the start.
-        observe: What is known at present: (scene, robot's clock [s], hand's place) → scene.
+        observe: What is known at present: (scene, robot's clock [s], measured configuration) →
+            scene.
         obstacle: Time [s] → centre of the moving obstacle, shape (3,); None without one.
         offset, drift: See `SimulatedRobot`.
     """
@@ -185,8 +186,7 @@ def _record(spec: dict[str, Any]) -> dict[str, Any]:
     robot = _make_robot(found, disturbance, spec)
 
     def observe(scene: Scene) -> Scene:
-        hand = scene.with_start(base=robot.read().positions[:3], arm=robot.read().positions[3:])
-        return disturbance.observe(scene, robot.time, hand.tool_placement().translation)
+        return disturbance.observe(scene, robot.time, robot.read().positions)
 
     result = execute(found, robot, observe=observe)
     robot.wait(robot.time + 1.0)
@@ -237,8 +237,8 @@ def _disturb(row: str, found: Plan, rng: np.random.Generator) -> Disturbance:
         actual = _displace(scene, name, largest, np.radians(turn), rng)
         placement = actual.objects[name].placement
 
-        def see(known: Scene, clock: float, hand: Floats) -> Scene:
-            is_seen = float(np.linalg.norm(hand - at_grasp)) < _NOTICE
+        def see(known: Scene, clock: float, measured: Floats) -> Scene:
+            is_seen = _is_near(scene, measured, at_grasp)
             if row == "grasp":
                 is_seen = clock > closing + found.options.grasp_time
             is_free = name not in known.held or not known.objects[name].object.free
@@ -252,8 +252,14 @@ def _disturb(row: str, found: Plan, rng: np.random.Generator) -> Disturbance:
         drift = (0.005 * np.cos(angle), 0.005 * np.sin(angle), np.radians(0.2) * signs[1])
         return _mislocalise(found, name, offset, drift, at_grasp)
     if row == "nothing":
-        return Disturbance(scene, lambda known, clock, hand: known)
+        return Disturbance(scene, lambda known, clock, measured: known)
     return _obstruct(row, found, closing, rng)
+
+
+def _is_near(scene: Scene, measured: Floats, place: Floats) -> bool:
+    """Return whether the hand is near enough to a place to see it."""
+    there = scene.with_start(base=measured[:3], arm=measured[3:], velocity={})
+    return float(np.linalg.norm(there.tool_placement().translation - place)) < _NOTICE
 
 
 def _displace(
@@ -283,11 +289,11 @@ def _mislocalise(
     at = found.scene.objects[name].placement
     start = found.scene.start[:2]
 
-    def see(known: Scene, clock: float, hand: Floats) -> Scene:
+    def see(known: Scene, clock: float, measured: Floats) -> Scene:
         is_free = name not in known.held or not known.objects[name].object.free
-        if np.linalg.norm(hand - at_grasp) > _NOTICE or not is_free:
+        if not (is_free and _is_near(found.scene, measured, at_grasp)):
             return known
-        base = known.start[:3]
+        base = measured[:3]
         travelled = float(np.linalg.norm(base[:2] - start))
         bias = np.array(offset) + np.array(drift) * travelled
         turn = pin.SE3(pin.utils.rotate("z", bias[2]), np.zeros(3))
@@ -326,7 +332,7 @@ def _obstruct(row: str, found: Plan, closing: float, rng: np.random.Generator) -
 
 
 def _see_obstacle(obstacle: Callable[[float], Floats]) -> Callable[[Scene, float, Floats], Scene]:
-    def see(known: Scene, clock: float, hand: Floats) -> Scene:
+    def see(known: Scene, clock: float, measured: Floats) -> Scene:
         return known.with_obstacle(_PERSON, [*obstacle(clock), 0.0, 0.0, 0.0])
 
     return see

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from vkc_pin.errors import InputError
@@ -20,6 +21,9 @@ from vkc_pin.world.task.actions import compile_each_step
 from vkc_pin.world.task.steps import Step
 from vkc_pin.world.trajectory.splicing import extract_times
 from vkc_pin.world.trajectory.world_model import find_phase_at
+
+# [m], [rad] between a measured and an assumed grasp: half of what validation accepts
+_SAME_GRASP = 5e-4
 
 
 def replan(
@@ -72,7 +76,7 @@ def replan(
         now = now.with_start(base=values[:3], arm=values[3:])
     if velocity is not None:
         now = now.with_start(velocity=velocity)
-    now = _measure_grasps(plan, now)
+    now = measure_grasps(now)
     motion = plan.trajectory
     rest = extract_times(motion, time, float(motion.times[-1]))
     prepared = prepare(now, steps, options=plan.options, terms=plan.terms, planner=planner)
@@ -94,17 +98,23 @@ def _check_scene(plan: Plan, scene: Scene) -> Scene:
     return scene
 
 
-def _measure_grasps(plan: Plan, scene: Scene) -> Scene:
-    """Return a scene in which objects that are not where the plan has them are held as they are.
+def measure_grasps(scene: Scene) -> Scene:
+    """Return a scene in which objects that are fixed in the world are held where the hand is.
+
+    Grasps that fit to within `_SAME_GRASP` are left as they are.
 
     Raises:
-        InputError: An object is too far from where the hand holds it.
+        InputError: An object is too far from the hand that holds it.
     """
     for hold in scene.holds:
-        planned = plan.scene.objects[hold.object].placement
-        is_fixed = not scene.objects[hold.object].object.free
-        if is_fixed and hold.by is None and scene.objects[hold.object].placement != planned:
-            scene = scene.with_measured_grasp(hold.object)
+        if hold.by is not None or scene.objects[hold.object].object.free:
+            continue
+        measured = scene.with_measured_grasp(hold.object)
+        (new,) = [other for other in measured.holds if other.object == hold.object]
+        none = (0.0,) * 6
+        change = np.subtract(new.deviation or none, hold.deviation or none)
+        if np.abs(change).max() > _SAME_GRASP:
+            scene = measured
     return scene
 
 

@@ -13,7 +13,7 @@ from vkc_pin.world.scene.contact_rules import compute_start_opening
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
-from vkc_pin.world.trajectory.world_model import World, compute_finger_positions, find_phase_at
+from vkc_pin.world.trajectory.world_model import World, compute_finger_positions
 
 # [s] of a motion at rest, which lasts longer, since motions hold their last configuration
 _REST_TIME = 1.0
@@ -66,8 +66,11 @@ class Reference:
         return int(np.searchsorted(begins, clock, side="right")) - 1
 
     def find_phase(self, clock: float) -> PhaseSpan:
-        """Return the phase at a time [s]."""
-        return find_phase_at(self.segments[self.find_segment(clock)].motion, clock)
+        """Return the phase at a time [s]; the hand closes when a phase that holds begins."""
+        motion = self.segments[self.find_segment(clock)].motion
+        begins = motion.times[[phase.first for phase in motion.phases]]
+        number = int(np.searchsorted(begins, clock, side="right")) - 1
+        return motion.phases[max(number, 0)]
 
     def send(self, motion: Trajectory, begin: float) -> None:
         """Let a motion take over; what begins later is discarded.
@@ -140,10 +143,7 @@ class Reference:
         found: list[tuple[int, PhaseSpan]] = []  # first time of each
         before: PhaseSpan | None = None
         for k, clock in enumerate(clocks[:-1].tolist()):
-            motion = self.segments[self.find_segment(clock)].motion
-            begins = motion.times[[phase.first for phase in motion.phases]]
-            number = int(np.searchsorted(begins, clock, side="right")) - 1
-            phase = motion.phases[max(number, 0)]
+            phase = self.find_phase(clock)
             if phase is not before:
                 found.append((k, phase))
             before = phase

@@ -139,10 +139,10 @@ def format_results(result: Mapping[str, Any]) -> str:
         "# Plans in a world that differs",
         f"{about['starts']} random starts per row and task, seed {about['seed']}, "
         f"{describe_limit(about)} each. Robots in physics are judged by what they really did: "
-        "goals within 10 mm and 0.02 rad, grasps that last, and no collision deeper than 1 mm with what "
-        "was not meant to be touched, while they move. Time passes for the robot while the program "
-        "computes. Latencies are the median and the 95th percentile of cycles that planned again; "
-        "cycles are those that kept 20 Hz.",
+        "goals within 10 mm and 0.02 rad, grasps that last, and no collision deeper than 1 mm with "
+        "what was not meant to be touched, while they move. Time passes for the robot while "
+        "the program computes. Latencies are the median and the 95th percentile of cycles that "
+        "planned again; cycles are those that kept 20 Hz.",
         "\n".join(f"- {row}: {ROWS[row]}" for row in about["rows"]),
         format_table(head, rows),
         "\n".join(lines),

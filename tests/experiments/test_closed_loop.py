@@ -1,0 +1,63 @@
+"""Tests the experiment that executes plans while the world differs from them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.experiments import run_experiment
+
+from vkc_pin.experiments.closed_loop import ROWS, _disturb
+from vkc_pin.experiments.tasks import TASKS, make_start
+from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.prepare import plan
+
+
+@pytest.fixture(scope="module")
+def drawer_plan() -> Plan:
+    found = plan(make_start("drawer", 1, 0), TASKS["drawer"].steps)
+    assert found.success, found.summary()
+    return found
+
+
+def test_undisturbed_plan_is_executed_open_and_closed_loop(tmp_path: Path) -> None:
+    arguments = "closed-loop --trials 1 --tasks drawer --rows nothing"
+    table, (trial,) = run_experiment(arguments, tmp_path)
+    assert trial["success"] is True, trial["violations"]
+    assert (trial["open"], trial["closed"]) == (True, True), trial
+    assert trial["decisions"] == {"go on": trial["cycles"]}
+    assert trial["closed_depth"] <= 1e-3
+    assert "| nothing | drawer | 1 of 1 | 1 of 1 | 1 of 1 |" in table
+
+
+@pytest.mark.parametrize("row", ["displaced", "grasp"])
+def test_object_is_seen_elsewhere_at_last(row: str, drawer_plan: Plan) -> None:
+    found = _disturb(row, drawer_plan, np.random.default_rng(0))
+    there = found.actual.objects["drawer"].placement
+    assert there != drawer_plan.scene.objects["drawer"].placement
+    motion = drawer_plan.trajectory
+    end = motion.at(motion.times[-1])[:9]
+    for clock, measured, seen in ((0.0, motion.at(0.0)[:9], False), (60.0, end, True)):
+        scene = found.observe(drawer_plan.scene, clock, measured)
+        assert (scene.objects["drawer"].placement == there) == seen
+
+
+@pytest.mark.parametrize("row", ["obstacle", "person"])
+def test_obstacle_is_where_it_is_seen(row: str, drawer_plan: Plan) -> None:
+    scene = drawer_plan.scene
+    document = dict(scene.document)
+    person = {"name": "person", "type": "cylinder", "radius": 0.2, "length": 1.6}
+    person["position"] = [0.0, 0.0, -5.0]
+    document["obstacles"] = [*document.get("obstacles", []), person]
+    with_person = type(scene).from_document(document, scene.folder)
+    found = _disturb(row, drawer_plan, np.random.default_rng(1))
+    assert found.obstacle is not None
+    for clock in (0.0, 2.0, 9.0):
+        seen = found.observe(with_person, clock, scene.start)
+        (shape,) = [one for one in seen.obstacles if one.name == "person"]
+        np.testing.assert_allclose(shape.placement.translation, found.obstacle(clock), atol=1e-12)
+
+
+def test_every_row_is_explained() -> None:
+    assert all(about and not about.endswith(".") for about in ROWS.values())

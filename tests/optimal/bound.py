@@ -27,7 +27,7 @@ def compute_bound(scene: Scene, motion: Trajectory, points: int = FINE) -> tuple
     paths = dict[int, tuple[Any, ...]]()
     rest_times = list[float]()
     compute_speeds = retime.compute_speeds
-    make_straight_curve = retime._make_straight_curve
+    stop_at_waypoints = retime._stop_at_waypoints
 
     def record_path(path: Any, places: Any, *limits: Any) -> Any:
         # The last call includes torque limits if they bind.
@@ -35,13 +35,13 @@ def compute_bound(scene: Scene, motion: Trajectory, points: int = FINE) -> tuple
         return compute_speeds(path, places, *limits)
 
     def record_rest(*arguments: Any) -> Any:
-        curve = make_straight_curve(*arguments)
+        curve, knots = stop_at_waypoints(*arguments)
         rest_times.append(float(curve.times[-1]))
-        return curve
+        return curve, knots
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(retime, "compute_speeds", record_path)
-        patch.setattr(retime, "_make_straight_curve", record_rest)
+        patch.setattr(retime, "_stop_at_waypoints", record_rest)
         retimed = retime.retime_trajectory(scene, motion, _count_parts(motion))
     assert abs(retimed.times[-1] - motion.times[-1]) <= _TOLERANCE, (
         "the retimed motion is another one"

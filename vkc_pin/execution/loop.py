@@ -23,6 +23,7 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 Observe = Callable[[Scene], Scene]
 """Puts what is known at present into a scene: placements of objects and obstacles."""
 
+_FIRST_SEARCH = 0.5  # [s] of the first search from rest
 _BRAKE_DELAY = 0.02  # [s] from the decision to brake to its begin, for sending the motion
 
 
@@ -108,6 +109,7 @@ class _Loop:
         # While the robot brakes or stands, the steps that are left, and the motion to guess from.
         self._waiting: tuple[tuple[Step, ...], Trajectory] | None = None
         self._rest_since = 0.0
+        self._attempts = 0  # to find a motion from rest
         self._late = 0
 
     def run(self) -> ExecutionResult:
@@ -131,7 +133,8 @@ class _Loop:
             decision, why = self._decide(now, self._robot.read())
             latency = time.perf_counter() - began
             self._cycles.append(Cycle(now, motion_time, latency, decision, why))
-            self._late += latency > self._period
+            # A robot at rest misses nothing while a motion is searched.
+            self._late += latency > self._period and decision in ("go on", "replan")
             if decision == "stop":
                 reason = why
             elif self._is_done(now):
@@ -176,7 +179,10 @@ class _Loop:
         if min(now, state.time) < begin:
             return "go on", ""  # a motion has been sent that has not begun
         scene = None if self._observe is None else self._look(plan.scene)
-        finding = self._monitor.check_world(self._get_motion_time(now), scene)
+        motion_time = self._get_motion_time(now)
+        finding, touched = self._monitor.check_world(motion_time, scene)
+        if finding and touched - motion_time < self._lead + self._measure_stop(motion_time):
+            return self._brake(finding)  # there is no time to look for another motion
         error = None
         if not finding:
             measured = self._get_motion_time(state.time)
@@ -216,6 +222,12 @@ class _Loop:
             finding = f"{finding}; {'too late' if found.success else found.status}"
         return self._brake(finding)
 
+    def _measure_stop(self, motion_time: float) -> float:
+        """Return how long it takes to brake from a time of the present motion [s]."""
+        plan = self._plan
+        stop = brake(plan.scene, plan.trajectory, motion_time, plan.options)
+        return float(stop.times[-1])
+
     def _brake(self, reason: str) -> tuple[Decision, str]:
         """Send a braking motion on the path.
 
@@ -239,6 +251,7 @@ class _Loop:
         stop = plan.stop(motion_time, scene=self._look(plan.scene_at(motion_time)))
         self._sent.append((begin, stop))
         self._rest_since = begin + float(motion.times[-1])
+        self._attempts = 0
         return "brake", reason
 
     def _plan_from_rest(
@@ -256,7 +269,12 @@ class _Loop:
             prepared = prepare(scene, steps, options=self._first.options, planner=self._planner)
         except InputError as impossible:
             return "wait", str(impossible)
-        found = prepared.solve(guess=guess, time_limit=max(self._time_limit, 1.0), explain=False)
+        # What was not found in a short search may be found in a longer one, with other numbers.
+        limit = max(self._time_limit, _FIRST_SEARCH) * 2.0**self._attempts
+        found = prepared.solve(
+            guess=guess, time_limit=limit, seed=self._first.seed + self._attempts, explain=False
+        )
+        self._attempts += 1
         if not found.success:
             return "wait", found.status
         if not self._send(found, self._robot.time + self._period):

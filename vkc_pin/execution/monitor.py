@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 
@@ -31,21 +33,30 @@ class Monitor:
         self.tracking = check_number(tracking, "tracking", low=0.0, strict=True)
         self._check = RemainingCheck(plan.scene, plan.steps, plan.trajectory, plan.options)
 
-    def check_world(self, time: float, scene: Scene | None) -> str:
+    def check_world(self, time: float, scene: Scene | None) -> tuple[str, float]:
         """Return why the world does not let the motion go on as planned; "" if it does.
 
         Args:
             time: Time of the motion [s].
             scene: The plan's scene with what was measured since: placements of objects and of
                 obstacles. None: nothing was.
+
+        Returns:
+            Also the time of the motion at which something in the way is first too near [s]; inf
+            without.
         """
         if scene is None:
-            return ""
+            return "", np.inf
         moved = self._find_moved_object(scene)
         if moved:
-            return f"{moved} is elsewhere"
+            return f"{moved} is elsewhere", np.inf
+        # Objects that are where the plan has them, to within tolerances, are there exactly.
+        scene = replace(scene, objects=self.plan.scene.objects)
         violations = self._check.find_violations(scene, time)
-        return violations[0].subject if violations else ""
+        if not violations:
+            return "", np.inf
+        first = min(violations, key=lambda violation: violation.time)
+        return first.subject, first.time
 
     def check_tracking(self, time: float, state: RobotState) -> str:
         """Return how the robot is off its motion at a time of the motion [s]; "" if it is not."""

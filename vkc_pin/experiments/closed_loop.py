@@ -27,7 +27,6 @@ from vkc_pin.simulation.physics import import_mujoco
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Actuate, Place
-from vkc_pin.world.trajectory.world_model import World
 
 TASKS = (
     "door",
@@ -43,7 +42,7 @@ ROWS: Mapping[str, str] = {
     "nothing": "the world is as planned",
     "displaced": "the object is up to 50 mm and 5° elsewhere, which is noticed at 1 m",
     "obstacle": "something appears on the path of the base",
-    "person": "a person crosses the path of the base at 0.5 to 1 m/s",
+    "person": "a person crosses the path of the base at 0.5 to 1 m/s, and is given 0.3 m of room",
     "localisation": "the base is localised 20 mm and 1° off, and drifts by 5 mm/m and 0.2°/m",
     "grasp": "the hand closes up to 8 mm and 3° off, which is noticed then",
 }
@@ -51,10 +50,12 @@ ROWS: Mapping[str, str] = {
 
 _PERSON = "person"
 _WIDTH = 0.2  # [m], radius of a person and of what appears
+# [m], radius of the room that a person may need before the robot has come to rest: 0.5 s at 0.6 m/s
+_ROOM = 0.5
 _HEIGHT = 1.6  # [m]
 _AWAY = -5.0  # [m], height at which an obstacle is out of the way, below the floor
 _NOTICE = 1.0  # [m] from the hand to its grasp at which an object is seen
-_PERIOD = 0.01  # [s] of the robot's record
+_FAR = 1.5  # [m] from a person to the origin of a shape; none is larger
 _MOVING = 0.02  # [m/s] or [rad/s]; slower, a robot stands, and who walks into it does so himself
 _REACHED = {"m": 0.01, "rad": 0.02}  # accepted miss of a goal, as in `execution`
 _DEEPEST = 1e-3  # [m] of collisions that count as none
@@ -172,7 +173,8 @@ def _record(spec: dict[str, Any]) -> dict[str, Any]:
     """Plan and execute a trial, open and closed loop, and return its record."""
     seed, row = spec["seed"], spec["row"]
     rng = np.random.default_rng([seed, list(ROWS).index(row), spec["number"]])
-    start = _add_person(make_start(spec["task"], seed, spec["number"]))
+    radius = _ROOM if row == "person" else _WIDTH
+    start = _add_person(make_start(spec["task"], seed, spec["number"]), radius)
     found = plan(start, ALL[spec["task"]].steps, seed=seed, **LIMITS)
     fields: dict[str, Any] = {"row": row, "task": spec["task"], "number": spec["number"]}
     if not found.success:
@@ -210,12 +212,12 @@ def _make_robot(found: Plan, disturbance: Disturbance, spec: Mapping[str, Any]) 
     )
 
 
-def _add_person(scene: Scene) -> Scene:
-    """Return a scene with a cylinder that is out of the way, below the floor."""
+def _add_person(scene: Scene, radius: float) -> Scene:
+    """Return a scene with a cylinder [m] that is out of the way, below the floor."""
     person = {
         "name": _PERSON,
         "type": "cylinder",
-        "radius": _WIDTH,
+        "radius": radius,
         "length": _HEIGHT,
         "position": [0.0, 0.0, _AWAY],
     }
@@ -234,7 +236,8 @@ def _disturb(row: str, found: Plan, rng: np.random.Generator) -> Disturbance:
     at_grasp = found.pose(None, closing).translation
     if row in ("displaced", "grasp"):
         largest, turn = (0.05, 5.0) if row == "displaced" else (0.008, 3.0)
-        actual = _displace(scene, name, largest, np.radians(turn), rng)
+        about = at_grasp if row == "grasp" else scene.objects[name].placement.translation
+        actual = _displace(scene, name, largest, np.radians(turn), about, rng)
         placement = actual.objects[name].placement
 
         def see(known: Scene, clock: float, measured: Floats) -> Scene:
@@ -263,15 +266,18 @@ def _is_near(scene: Scene, measured: Floats, place: Floats) -> bool:
 
 
 def _displace(
-    scene: Scene, name: str, largest: float, turn: float, rng: np.random.Generator
+    scene: Scene, name: str, largest: float, turn: float, about: Floats, rng: np.random.Generator
 ) -> Scene:
-    """Return a scene with an object elsewhere by up to a distance [m] and an angle [rad]."""
+    """Return a scene with an object elsewhere, by up to a distance [m] and an angle [rad].
+
+    It is turned about the vertical through a place, shape (3,).
+    """
     at = scene.objects[name].placement
     angle, direction = rng.uniform(-turn, turn), rng.uniform(0.0, 2.0 * np.pi)
-    distance = largest * rng.uniform()
-    shift = distance * np.array([np.cos(direction), np.sin(direction), 0.0])
-    rotation = pin.utils.rotate("z", angle) @ at.rotation
-    return scene.with_placement(name, pin.SE3(rotation, at.translation + shift))
+    shift = largest * rng.uniform() * np.array([np.cos(direction), np.sin(direction), 0.0])
+    rotation = pin.utils.rotate("z", angle)
+    position = about + rotation @ (at.translation - about) + shift
+    return scene.with_placement(name, pin.SE3(rotation @ at.rotation, position))
 
 
 def _mislocalise(
@@ -393,23 +399,22 @@ def _measure_depth(
     scene: Scene, robot: SimulatedRobot, obstacle: Callable[[float], Floats]
 ) -> float:
     """Return how deep the robot, while it moved, was in a moving cylinder [m]."""
-    world = World(scene)
-    data = world.model.createData()
-    size = len(scene.robot.collision.geometryObjects)
+    model, shapes = scene.robot.model, scene.robot.collision.geometryObjects
+    data = model.createData()
     solid = coal.Cylinder(_WIDTH, _HEIGHT)
     request, answer = coal.DistanceRequest(), coal.DistanceResult()
     request.enable_signed_distance = True
-    rows = robot.rows
+    motion = robot.trajectory()
+    positions = motion.positions[:, : motion.robot_size]
+    speeds = np.abs(np.diff(positions, axis=0)).max(axis=1) / np.diff(motion.times)
     deepest = 0.0
-    for number in range(1, len(rows)):
-        speed = np.abs(rows[number] - rows[number - 1])[: len(scene.start)].max() / _PERIOD
-        if speed < _MOVING:
-            continue
-        centre = obstacle(number * _PERIOD)
-        pin.forwardKinematics(world.model, data, world.coordinates.q(rows[number]))
-        for shape in world.shapes[:size]:
+    for number in np.flatnonzero(speeds > _MOVING).tolist():
+        centre = obstacle(float(motion.times[number]))
+        q = scene.robot.coordinates.q(positions[number])
+        pin.forwardKinematics(model, data, q)
+        for shape in shapes:
             placement = data.oMi[shape.parentJoint] * shape.placement
-            if np.linalg.norm(placement.translation[:2] - centre[:2]) > 1.5:
+            if np.linalg.norm(placement.translation[:2] - centre[:2]) > _FAR:
                 continue
             answer.clear()
             distance = coal.distance(

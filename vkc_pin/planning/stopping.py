@@ -59,8 +59,11 @@ def brake(scene: Scene, motion: Trajectory, time: float, options: Options) -> Tr
         braking = _find_least(factors, offsets, np.concatenate([limit, limit]))
         next_square = square + 2.0 * braking * duration
         if next_square <= 0.0:
-            clocks.append(float(places[k]) - square / (2.0 * braking))
-            squares.append(0.0)
+            way = -square / (2.0 * braking)
+            if way > _SLOW:
+                clocks.append(float(places[k]) + way)
+                squares.append(0.0)
+            squares[-1] = 0.0
             break
         clocks.append(float(places[k + 1]))
         squares.append(next_square)

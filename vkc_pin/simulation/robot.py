@@ -154,11 +154,16 @@ class SimulatedRobot:
         self._advance(0.0)
 
     def __repr__(self) -> str:
-        return f"<SimulatedRobot {self._scene.robot.name} at {self.time:.2f} s>"
+        return f"<SimulatedRobot {self._scene.robot.name} at {self._clock:.2f} s>"
 
     @property
     def time(self) -> float:
         """Time of the robot's clock [s]."""
+        with self._take_turn():
+            return self._clock
+
+    @property
+    def _clock(self) -> float:
         return self._number * self._physics.timestep
 
     def read(self) -> RobotState:
@@ -199,8 +204,8 @@ class SimulatedRobot:
         begin = check_number(begin, "begin", "a time [s]")
         self._check_motion(motion)
         with self._take_turn():
-            if begin < self.time - _ROUNDING:
-                expected = f"a time from {self.time:g} s on"
+            if begin < self._clock - _ROUNDING:
+                expected = f"a time from {self._clock:g} s on"
                 raise InputError("this is over", field="begin", expected=expected, got=begin)
             self._reference.send(motion, begin)
             self._reschedule()
@@ -212,7 +217,7 @@ class SimulatedRobot:
             InputError: The integration diverged.
         """
         with self._take_turn():
-            self._reference.rest(self._measured_positions(), self.time)
+            self._reference.rest(self._measured_positions(), self._clock)
             self._reschedule()
 
     def wait(self, until: float) -> None:
@@ -223,7 +228,7 @@ class SimulatedRobot:
         """
         until = check_number(until, "until", "a time [s]")
         with self._take_turn():
-            if until > self.time:
+            if until > self._clock:
                 self._pending = 0.0
                 self._advance(until)
                 self._check_stable()
@@ -308,7 +313,7 @@ class SimulatedRobot:
             step_count = int(self._pending / self._physics.timestep)
             passed = step_count * self._physics.timestep
             self._pending -= passed
-            self._advance(self.time + passed)
+            self._advance(self._clock + passed)
         self._check_stable()
         try:
             yield
@@ -347,7 +352,7 @@ class SimulatedRobot:
     def _make_stepper(self) -> Stepper:
         """Return the physics of the scene with welds for all holds so far."""
         spans = self._reference.spans
-        motion = self._reference.segments[self._reference.find_segment(self.time)].motion
+        motion = self._reference.segments[self._reference.find_segment(self._clock)].motion
         return Stepper(self._tree, self._physics, self._servos, self._holds, spans, motion)
 
     def _reschedule(self) -> None:
@@ -368,8 +373,8 @@ class SimulatedRobot:
 
         Its shape is (servos,), [m] and [rad].
         """
-        self._stepper.switch(self.time)
-        _, commands = self._compute_commands(np.array([self.time]))
+        self._stepper.switch(self._clock)
+        _, commands = self._compute_commands(np.array([self._clock]))
         self._stepper.command(commands[0])
         return self._stepper.balance_load(self._size)
 
@@ -410,7 +415,7 @@ class SimulatedRobot:
             command: Commands of the servos, shape (servos,), [m] and [rad].
         """
         stepper = self._stepper
-        clock = self.time
+        clock = self._clock
         is_recorded = self._number % self._record_steps == 0
         number = self._reference.find_segment(clock)
         stepper.grips.trajectory = self._reference.segments[number].motion

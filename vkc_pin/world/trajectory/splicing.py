@@ -9,10 +9,11 @@ import numpy as np
 
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arrays import Floats
-from vkc_pin.world.trajectory.curve import Curve
+from vkc_pin.world.trajectory.curve import MIN_INTERVAL, Curve
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
+_SHORTEST = 10.0 * MIN_INTERVAL  # [s] between two knots
 _MAX_GAP = 1e-6  # [m], [rad] between the end of a motion and the begin of the next
 
 
@@ -134,24 +135,28 @@ def extract_times(trajectory: Trajectory, begin: float, end: float) -> Trajector
 
     Phases without duration in between are left out. The times of the part are the original ones.
     """
-    inside = trajectory.times[(trajectory.times > begin) & (trajectory.times < end)]
-    times = np.concatenate([[begin], inside, [end]])
+    times = _cut(trajectory.times, begin, end)
     spans = list[PhaseSpan]()
     for phase in trajectory.phases:
         first, last = np.clip(trajectory.times[[phase.first, phase.last]], begin, end)
-        if last > first:
-            rows = np.searchsorted(times, [first, last]).tolist()
+        rows = np.searchsorted(times, [first - _SHORTEST, last - _SHORTEST]).tolist()
+        if rows[1] > rows[0]:
             spans.append(replace(phase, first=rows[0], last=rows[1]))
     curve = trajectory.curve
     positions = trajectory.at(times)
     if curve is not None:
         # A part of a cubic is the cubic with the same positions and velocities at its ends.
-        knots_inside = curve.times[(curve.times > begin) & (curve.times < end)]
-        knots = np.concatenate([[begin], knots_inside, [end]])
+        knots = _cut(curve.times, begin, end)
         curve = Curve(knots, curve.at(knots), curve.velocity(knots))
         positions = curve.positions[np.searchsorted(knots, times)]
     names = trajectory.names
     return Trajectory(names, times, positions, tuple(spans), trajectory.robot_size, curve)
+
+
+def _cut(times: Floats, begin: float, end: float) -> Floats:
+    """Return times between two others, with these, without those that are too near to them."""
+    inside = times[(times > begin + _SHORTEST) & (times < end - _SHORTEST)]
+    return np.concatenate([[begin], inside, [end]])
 
 
 def extract_phases(

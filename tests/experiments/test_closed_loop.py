@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +40,7 @@ def test_object_is_seen_elsewhere_at_last(row: str, drawer_plan: Plan) -> None:
     motion = drawer_plan.trajectory
     end = motion.at(motion.times[-1])[:9]
     for clock, measured, seen in ((0.0, motion.at(0.0)[:9], False), (60.0, end, True)):
-        scene = found.observe(drawer_plan.scene, clock, measured)
+        scene = found.observe(drawer_plan.scene, clock, measured, 0.0)
         assert (scene.objects["drawer"].placement == there) == seen
 
 
@@ -51,10 +52,11 @@ def test_obstacle_is_where_it_is_seen(row: str, drawer_plan: Plan) -> None:
     person["position"] = [0.0, 0.0, -5.0]
     document["obstacles"] = [*document.get("obstacles", []), person]
     with_person = type(scene).from_document(document, scene.folder)
-    found = _disturb(row, drawer_plan, np.random.default_rng(1))
+    planned = dataclasses.replace(drawer_plan, scene=with_person)
+    found = _disturb(row, planned, np.random.default_rng(1))
     assert found.obstacle is not None
     for clock in (0.0, 2.0, 9.0):
-        seen = found.observe(with_person, clock, scene.start)
+        seen = found.observe(with_person, clock, scene.start, 0.0)
         (shape,) = [one for one in seen.obstacles if one.name == "person"]
         np.testing.assert_allclose(shape.placement.translation, found.obstacle(clock), atol=1e-12)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -25,6 +26,7 @@ from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.prepare import plan
 from vkc_pin.simulation.physics import import_mujoco
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Actuate, Place
 
@@ -41,7 +43,7 @@ TASKS = (
 ROWS: Mapping[str, str] = {
     "nothing": "the world is as planned",
     "displaced": "the object is up to 50 mm and 5° elsewhere, which is noticed at 1 m",
-    "obstacle": "something appears on the path of the base",
+    "obstacle": "something appears in the way, 1.5 m ahead of the base, and leaves a way round",
     "person": "a person crosses the path of the base at 0.5 to 1 m/s, and is given 0.3 m of room",
     "localisation": "the base is localised 20 mm and 1° off, and drifts by 5 mm/m and 0.2°/m",
     "grasp": "the hand closes up to 8 mm and 3° off, which is noticed then",
@@ -56,9 +58,15 @@ _HEIGHT = 1.6  # [m]
 _AWAY = -5.0  # [m], height at which an obstacle is out of the way, below the floor
 _NOTICE = 1.0  # [m] from the hand to its grasp at which an object is seen
 _FAR = 1.5  # [m] from a person to the origin of a shape; none is larger
+_BRAKING = 1.5  # [m] from the base's origin at which something may appear
+_DRAWS = 20  # of places
+_FEW = 200_000  # evaluations for a motion round it
 _MOVING = 0.02  # [m/s] or [rad/s]; slower, a robot stands, and who walks into it does so himself
 _REACHED = {"m": 0.01, "rad": 0.02}  # accepted miss of a goal, as in `execution`
 _DEEPEST = 1e-3  # [m] of collisions that count as none
+
+
+Observation = Callable[[Scene, float, Floats, float], Scene]
 
 
 @dataclass(frozen=True)
@@ -67,14 +75,14 @@ class Disturbance:
 
     Attributes:
         actual: The scene as it really is, at the start.
-        observe: What is known at present: (scene, robot's clock [s], measured configuration) →
-            scene.
+        observe: What is known at present: (scene, robot's clock [s], measured configuration, and
+            path length of the base so far [m]) → scene.
         obstacle: Time [s] → centre of the moving obstacle, shape (3,); None without one.
         offset, drift: See `SimulatedRobot`.
     """
 
     actual: Scene
-    observe: Callable[[Scene, float, Floats], Scene]
+    observe: Observation
     obstacle: Callable[[float], Floats] | None = None
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     drift: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -188,7 +196,9 @@ def _record(spec: dict[str, Any]) -> dict[str, Any]:
     robot = _make_robot(found, disturbance, spec)
 
     def observe(scene: Scene) -> Scene:
-        return disturbance.observe(scene, robot.time, robot.read().positions)
+        base = robot.rows[:, :2]
+        travelled = float(np.linalg.norm(np.diff(base, axis=0), axis=1).sum())
+        return disturbance.observe(scene, robot.time, robot.read().positions, travelled)
 
     result = execute(found, robot, observe=observe)
     robot.wait(robot.time + 1.0)
@@ -240,7 +250,7 @@ def _disturb(row: str, found: Plan, rng: np.random.Generator) -> Disturbance:
         actual = _displace(scene, name, largest, np.radians(turn), about, rng)
         placement = actual.objects[name].placement
 
-        def see(known: Scene, clock: float, measured: Floats) -> Scene:
+        def see(known: Scene, clock: float, measured: Floats, travelled: float) -> Scene:
             is_seen = _is_near(scene, measured, at_grasp)
             if row == "grasp":
                 is_seen = clock > closing + found.options.grasp_time
@@ -255,7 +265,7 @@ def _disturb(row: str, found: Plan, rng: np.random.Generator) -> Disturbance:
         drift = (0.005 * np.cos(angle), 0.005 * np.sin(angle), np.radians(0.2) * signs[1])
         return _mislocalise(found, name, offset, drift, at_grasp)
     if row == "nothing":
-        return Disturbance(scene, lambda known, clock, measured: known)
+        return Disturbance(scene, lambda known, *_: known)
     return _obstruct(row, found, closing, rng)
 
 
@@ -293,14 +303,12 @@ def _mislocalise(
     it is at q: in its frame, the object is moved by the bias b.
     """
     at = found.scene.objects[name].placement
-    start = found.scene.start[:2]
 
-    def see(known: Scene, clock: float, measured: Floats) -> Scene:
+    def see(known: Scene, clock: float, measured: Floats, travelled: float) -> Scene:
         is_free = name not in known.held or not known.objects[name].object.free
         if not (is_free and _is_near(found.scene, measured, at_grasp)):
             return known
         base = measured[:3]
-        travelled = float(np.linalg.norm(base[:2] - start))
         bias = np.array(offset) + np.array(drift) * travelled
         turn = pin.SE3(pin.utils.rotate("z", bias[2]), np.zeros(3))
         about = pin.SE3(np.eye(3), np.array([base[0] - bias[0], base[1] - bias[1], 0.0]))
@@ -320,14 +328,7 @@ def _obstruct(row: str, found: Plan, closing: float, rng: np.random.Generator) -
     along = velocity / max(float(np.linalg.norm(velocity)), 1e-9)
     across = np.array([-along[1], along[0]])
     if row == "obstacle":
-        place = place + across * rng.uniform(-0.4, 0.4)
-        appears = 0.3 * moment
-
-        def stand(clock: float) -> Floats:
-            height = _HEIGHT / 2 if clock >= appears else _AWAY
-            return np.array([*place, height])
-
-        return Disturbance(found.scene, _see_obstacle(stand), stand)
+        return _appear(found, closing, rng)
     speed = rng.uniform(0.5, 1.0) * rng.choice([-1.0, 1.0])
     crosses = moment + rng.uniform(-0.5, 0.5)
 
@@ -337,8 +338,38 @@ def _obstruct(row: str, found: Plan, closing: float, rng: np.random.Generator) -
     return Disturbance(found.scene, _see_obstacle(walk), walk)
 
 
-def _see_obstacle(obstacle: Callable[[float], Floats]) -> Callable[[Scene, float, Floats], Scene]:
-    def see(known: Scene, clock: float, measured: Floats) -> Scene:
+def _appear(found: Plan, closing: float, rng: np.random.Generator) -> Disturbance:
+    """Return something that appears ahead of the base, so that there still is a motion.
+
+    The robot could brake before it, and a motion is found if it is there from the start.
+    """
+    motion = found.trajectory
+    times = np.linspace(0.0, closing, 200)
+    path = motion.at(times)[:, :2]
+    for _ in range(_DRAWS):
+        moment = int(rng.integers(len(times) // 3, len(times)))
+        place = path[moment] + rng.uniform(-0.5, 0.5, 2)
+        is_far = np.linalg.norm(path - place, axis=1) > _BRAKING
+        if not is_far[0]:
+            continue
+        last = int(np.argmin(is_far)) - 1 if not is_far.all() else len(times) - 1
+        appears = float(times[last])
+        there = found.scene.with_obstacle(_PERSON, [*place, _HEIGHT / 2, 0.0, 0.0, 0.0])
+        if validate(there, found.steps, motion, found.options).ok:
+            continue  # it is not in the way
+        if plan(there, found.steps, max_evaluations=_FEW).success:
+            break
+    else:
+        appears = math.inf
+
+    def stand(clock: float) -> Floats:
+        return np.array([*place, _HEIGHT / 2 if clock >= appears else _AWAY])
+
+    return Disturbance(found.scene, _see_obstacle(stand), stand)
+
+
+def _see_obstacle(obstacle: Callable[[float], Floats]) -> Observation:
+    def see(known: Scene, clock: float, measured: Floats, travelled: float) -> Scene:
         return known.with_obstacle(_PERSON, [*obstacle(clock), 0.0, 0.0, 0.0])
 
     return see

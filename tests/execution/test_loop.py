@@ -109,7 +109,7 @@ def test_robot_brakes_before_a_wall_and_gives_up() -> None:
         pose = [at[0] - 0.4, at[1] - 0.5, 0.25, 0.0, 0.0, 0.0]
         return scene.with_obstacle("sofa", pose) if time > 1.0 else scene
 
-    result, robot = run(observe, patience=1.0, time_limit=1.0)
+    result, robot = run(observe, patience=0.3, time_limit=1.0)
     assert not result.success
     assert "no motion was found from rest" in result.reason
     decisions = result.count_decisions()

@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
+import coal
+
 from vkc_pin.errors import InputError, format_value
 from vkc_pin.execution.monitor import Monitor
 from vkc_pin.execution.record import Cycle, Decision, ExecutionResult
@@ -16,6 +18,7 @@ from vkc_pin.planning.replan import find_remaining_steps, measure_grasps, replan
 from vkc_pin.planning.stopping import brake
 from vkc_pin.utils.arguments import check_instance, check_number
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.models.shapes import triangulate
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Step
 from vkc_pin.world.trajectory.trajectory import Trajectory
@@ -23,6 +26,7 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 Observe = Callable[[Scene], Scene]
 """Puts what is known at present into a scene: placements of objects and obstacles."""
 
+_REHEARSAL = 10.0  # [s], limit of a plan that is made before the robot moves
 _FIRST_SEARCH = 0.5  # [s] of the first search from rest
 _BRAKE_DELAY = 0.02  # [s] from the decision to brake to its begin, for sending the motion
 
@@ -119,6 +123,7 @@ class _Loop:
         if finding:
             expected = "a robot at the start of the plan"
             raise InputError("not at its start", field="robot", expected=expected, got=finding)
+        self._rehearse()
         begin = self._robot.time + self._period
         self._robot.send(self._first.trajectory, begin)
         self._sent.append((begin, self._first))
@@ -143,6 +148,15 @@ class _Loop:
         return ExecutionResult(
             self._first, not reason, reason, tuple(self._cycles), tuple(self._sent), self._late
         )
+
+    def _rehearse(self) -> None:
+        """Plan the rest of the motion before it begins, to load and build what that takes.
+
+        The first time it takes up to seconds, for which a moving robot has no time.
+        """
+        triangulate(coal.Box(1.0, 1.0, 1.0))  # imports what other surfaces take, too
+        begin = float(self._first.trajectory.times[0])
+        replan(self._first, begin, time_limit=_REHEARSAL, planner=self._planner)
 
     @property
     def _plan(self) -> Plan:
@@ -270,7 +284,8 @@ class _Loop:
         except InputError as impossible:
             return "wait", str(impossible)
         # What was not found in a short search may be found in a longer one, with other numbers.
-        limit = max(self._time_limit, _FIRST_SEARCH) * 2.0**self._attempts
+        first = max(self._time_limit, _FIRST_SEARCH)
+        limit = min(first * 2.0**self._attempts, max(self._patience, first))
         found = prepared.solve(
             guess=guess, time_limit=limit, seed=self._first.seed + self._attempts, explain=False
         )

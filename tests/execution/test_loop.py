@@ -137,6 +137,48 @@ def test_robot_off_its_motion_is_brought_back() -> None:
     assert any("base_x is 0.05 m off" in reason for reason in reasons)
 
 
+def test_robot_that_stops_answering_is_stopped() -> None:
+    class Silent(IdealRobot):
+        """A robot whose measurements end at 1 s, and that notes when it is stopped."""
+
+        stopped = False
+
+        def read(self) -> RobotState:
+            return self.compute_state(min(self.time, 1.0))
+
+        def stop(self) -> None:
+            self.stopped = True
+
+    plan = plan_door()
+    robot = Silent(plan.scene, is_simulated=True)
+    result = execute(plan, robot, tracking=10.0, **CALM)
+    assert not result.success
+    assert "the robot's state is 0.5" in result.reason
+    assert robot.stopped
+    assert robot.time < 1.7
+
+
+def test_robot_is_stopped_if_the_program_fails() -> None:
+    class Broken(IdealRobot):
+        """A robot whose connection breaks at 1 s."""
+
+        stopped = False
+
+        def read(self) -> RobotState:
+            if self.time > 1.0:
+                raise ConnectionError("no route to the robot")
+            return super().read()
+
+        def stop(self) -> None:
+            self.stopped = True
+
+    plan = plan_door()
+    robot = Broken(plan.scene, is_simulated=True)
+    with pytest.raises(ConnectionError, match="no route"):
+        execute(plan, robot, **CALM)
+    assert robot.stopped
+
+
 def test_robot_must_stand_at_the_start_of_the_plan() -> None:
     plan = plan_door()
     elsewhere = plan.scene.with_start(base=(0.0, 0.0, 0.0))

@@ -26,6 +26,7 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 Observe = Callable[[Scene], Scene]
 """Puts what is known at present into a scene: placements of objects and obstacles."""
 
+_STALE = 0.5  # [s], age of a measured state with which no robot is moved on
 _REHEARSAL = 10.0  # [s], limit of a plan that is made before the robot moves
 _FIRST_SEARCH = 0.5  # [s] of the first search from rest
 _BRAKE_DELAY = 0.02  # [s] from the decision to brake to its begin, for sending the motion
@@ -128,9 +129,18 @@ class _Loop:
         self._robot.send(self._first.trajectory, begin)
         self._sent.append((begin, self._first))
         self._monitor = monitor
-        next_cycle = begin
-        reason = ""
-        while not reason:
+        try:
+            reason = self._run_cycles(begin)
+        except BaseException:  # also Ctrl-C: nobody watches the robot any more
+            self._robot.stop()
+            raise
+        return ExecutionResult(
+            self._first, not reason, reason, tuple(self._cycles), tuple(self._sent), self._late
+        )
+
+    def _run_cycles(self, next_cycle: float) -> str:
+        """Run cycles until the motion is over; return why it cannot go on, "" if it is done."""
+        while True:
             self._robot.wait(next_cycle)
             now = self._robot.time
             began = time.perf_counter()
@@ -141,13 +151,10 @@ class _Loop:
             # A robot at rest misses nothing while a motion is searched.
             self._late += latency > self._period and decision in ("go on", "replan")
             if decision == "stop":
-                reason = why
-            elif self._is_done(now):
-                break
+                return why
+            if self._is_done(now):
+                return self._monitor.check_tracking(self._get_motion_time(now), self._robot.read())
             next_cycle = max(next_cycle + self._period, self._robot.time)
-        return ExecutionResult(
-            self._first, not reason, reason, tuple(self._cycles), tuple(self._sent), self._late
-        )
 
     def _rehearse(self) -> None:
         """Plan the rest of the motion before it begins, to load and build what that takes.
@@ -188,6 +195,9 @@ class _Loop:
 
     def _decide(self, now: float, state: RobotState) -> tuple[Decision, str]:
         begin, plan = self._sent[-1]
+        if now - state.time > _STALE:
+            self._robot.stop()
+            return "stop", f"the robot's state is {now - state.time:.2g} s old"
         if self._waiting is not None:
             return self._plan_from_rest(now, self._waiting)
         if min(now, state.time) < begin:

@@ -15,7 +15,8 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
-from vkc_pin.execution import ExecutionResult, SimulatedRobot, execute
+from vkc_pin.execution.loop import execute
+from vkc_pin.execution.record import ExecutionResult
 from vkc_pin.experiments.harness import runner
 from vkc_pin.experiments.harness.record import Record, trial, values
 from vkc_pin.experiments.harness.runner import LIMITS, Execution, describe_limit
@@ -25,6 +26,7 @@ from vkc_pin.experiments.tasks import make_start
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.prepare import plan
 from vkc_pin.simulation.physics import import_mujoco
+from vkc_pin.simulation.robot import SimulatedRobot
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.scene import Scene

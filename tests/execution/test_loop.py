@@ -39,7 +39,7 @@ def run(
 
 
 def sample_motion(robot: IdealRobot, end: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return times and positions of what the robot did."""
+    """Return times and positions of the robot."""
     times = np.arange(0.0, end, 1e-3)
     return times, np.array([robot.compute_state(time).positions for time in times])
 

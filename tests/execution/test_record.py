@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
-from docs.pictures.closed_loop import walk_by
+from docs.pictures.closed_loop import execute_with_passer_by
 from vkc_pin.execution import ExecutionResult
 
 
 @cache
 def execute_beside_a_person() -> ExecutionResult:
-    result = walk_by()
+    result = execute_with_passer_by()
     assert result.success, result.summary()
     return result
 

@@ -1,4 +1,4 @@
-"""Tests that what is left of a motion is judged like the whole one when obstacles move."""
+"""Tests that the rest of a motion is judged like the whole one when obstacles move."""
 
 from __future__ import annotations
 

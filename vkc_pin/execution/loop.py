@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 
 import coal
+import numpy as np
 
 from vkc_pin.errors import InputError, format_value
 from vkc_pin.execution.monitor import Monitor
@@ -24,7 +25,7 @@ from vkc_pin.world.task.steps import Step
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 Observe = Callable[[Scene], Scene]
-"""Puts what is known at present into a scene: placements of objects and obstacles."""
+"""Updates a scene with the present placements of objects and obstacles, as far as known."""
 
 _STALE = 0.5  # [s], age of a measured state with which no robot is moved on
 _REHEARSAL = 10.0  # [s], limit of a plan that is made before the robot moves
@@ -46,16 +47,17 @@ def execute(
 ) -> ExecutionResult:
     """Execute a plan on a robot, and react to what differs from it.
 
-    In every cycle, the state of the robot is compared with the plan, and what is left of the motion
-    with the world as it is known then. If an object is elsewhere, an obstacle in the way, or the
-    robot off its motion, the rest is planned again, to begin `lead` seconds later, while the robot
-    goes on. If no new motion is there in time, the robot brakes on its path, and plans from rest.
+    In every cycle, the state of the robot is compared with the plan, and the rest of the motion
+    with the present world. If an object is elsewhere, an obstacle too near, or the robot off its
+    motion, the rest is planned again, to begin `lead` seconds later, while the robot goes on. If no
+    new motion is found in time, the robot brakes on its path, and plans from rest.
 
     Args:
         plan: A successful plan, in whose start the robot stands.
         robot: The robot.
         rate: Cycles per second [Hz].
-        observe: Puts what is known at present into a scene. Default: nothing changes.
+        observe: Updates a scene with the present placements of objects and obstacles. Default:
+            nothing changes.
         lead: Time from a decision to the begin of the new motion, within which it must be found
             [s].
         time_limit: Wall-clock limit of planning again [s]. Default: `lead`. More makes sense for a
@@ -152,8 +154,9 @@ class _Loop:
             self._late += latency > self._period and decision in ("go on", "replan")
             if decision == "stop":
                 return why
-            if self._is_done(now):
-                return self._monitor.check_tracking(self._get_motion_time(now), self._robot.read())
+            end = float(self._plan.trajectory.times[-1])
+            if self._waiting is None and self._get_motion_time(now) >= end:
+                return self._monitor.check_tracking(end, self._robot.read())
             next_cycle = max(next_cycle + self._period, self._robot.time)
 
     def _rehearse(self) -> None:
@@ -175,10 +178,6 @@ class _Loop:
         first = float(plan.trajectory.times[0])
         return min(max(now - begin + first, first), float(plan.trajectory.times[-1]))
 
-    def _is_done(self, now: float) -> bool:
-        begin, plan = self._sent[-1]
-        return self._waiting is None and now - begin >= float(plan.trajectory.times[-1])
-
     def _send(self, plan: Plan, begin: float) -> bool:
         """Send a plan's motion; return whether it is not too late for that."""
         monitor = Monitor(plan, tracking=self._tracking)
@@ -190,7 +189,7 @@ class _Loop:
         return True
 
     def _look(self, scene: Scene) -> Scene:
-        """Return a scene with what is known at present."""
+        """Return a scene with the present placements of objects and obstacles."""
         return scene if self._observe is None else self._observe(scene)
 
     def _decide(self, now: float, state: RobotState) -> tuple[Decision, str]:
@@ -205,8 +204,10 @@ class _Loop:
         scene = None if self._observe is None else self._look(plan.scene)
         motion_time = self._get_motion_time(now)
         finding, touched = self._monitor.check_world(motion_time, scene)
-        if finding and touched - motion_time < self._lead + self._measure_stop(motion_time):
-            return self._brake(finding)  # there is no time to look for another motion
+        if np.isfinite(touched):
+            stop = self._make_stop(motion_time)
+            if touched - motion_time < self._lead + float(stop.times[-1]):
+                return self._brake(finding)  # there is no time to look for another motion
         error = None
         if not finding:
             measured = self._get_motion_time(state.time)
@@ -246,11 +247,10 @@ class _Loop:
             finding = f"{finding}; {'too late' if found.success else found.status}"
         return self._brake(finding)
 
-    def _measure_stop(self, motion_time: float) -> float:
-        """Return how long it takes to brake from a time of the present motion [s]."""
+    def _make_stop(self, motion_time: float) -> Trajectory:
+        """Return the motion that brakes from a time of the present motion on [s]."""
         plan = self._plan
-        stop = brake(plan.scene, plan.trajectory, motion_time, plan.options)
-        return float(stop.times[-1])
+        return brake(plan.scene, plan.trajectory, motion_time, plan.options)
 
     def _brake(self, reason: str) -> tuple[Decision, str]:
         """Send a braking motion on the path.
@@ -262,7 +262,7 @@ class _Loop:
         while True:
             begin = self._robot.time + delay
             motion_time = self._get_motion_time(begin)
-            motion = brake(plan.scene, plan.trajectory, motion_time, plan.options)
+            motion = self._make_stop(motion_time)
             if self._robot.time < begin:
                 break
             delay *= 2.0  # on a slow machine
@@ -272,7 +272,7 @@ class _Loop:
         except InputError:
             return "stop", reason
         self._waiting = (steps, plan.trajectory)
-        stop = plan.stop(motion_time, scene=self._look(plan.scene_at(motion_time)))
+        stop = plan.check_stop(motion, self._look(plan.scene_at(motion_time)))
         self._sent.append((begin, stop))
         self._rest_since = begin + float(motion.times[-1])
         self._attempts = 0
@@ -290,10 +290,15 @@ class _Loop:
         end = float(self._plan.trajectory.times[-1])
         try:
             scene = measure_grasps(self._look(self._plan.scene_at(end)))
-            prepared = prepare(scene, steps, options=self._first.options, planner=self._planner)
+            prepared = prepare(
+                scene,
+                steps,
+                options=self._first.options,
+                planner=self._planner,
+            )
         except InputError as impossible:
             return "wait", str(impossible)
-        # What was not found in a short search may be found in a longer one, with other numbers.
+        # Each search is longer than the one before, with other random numbers.
         first = max(self._time_limit, _FIRST_SEARCH)
         limit = min(first * 2.0**self._attempts, max(self._patience, first))
         found = prepared.solve(

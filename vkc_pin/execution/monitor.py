@@ -13,13 +13,13 @@ from vkc_pin.utils.arguments import check_number
 from vkc_pin.validation.remaining import RemainingCheck
 from vkc_pin.world.scene.scene import Scene
 
-# Displacement of an object from which on the motion to it is planned again [m], [rad]: what
-# validation accepts at a grasp.
+# Displacement of an object from which on the motion to it is planned again [m], [rad]: validation
+# accepts 1 mm at a grasp, and 2 mrad are 2 mm at a lever of a metre.
 _OBJECT_TOLERANCES = (1e-3, 2e-3)
 
 
 class Monitor:
-    """Checks what is left of a plan's motion against the present world and robot.
+    """Checks the rest of a plan's motion against the present world and robot.
 
     Args:
         plan: A successful plan.
@@ -38,12 +38,11 @@ class Monitor:
 
         Args:
             time: Time of the motion [s].
-            scene: The plan's scene with what was measured since: placements of objects and of
-                obstacles. None: nothing was.
+            scene: The plan's scene with the present placements of objects and of obstacles. None:
+                they are unknown.
 
         Returns:
-            Also the time of the motion at which something in the way is first too near [s]; inf
-            without.
+            Also the time of the motion at which an obstacle is first too near [s]; inf without.
         """
         if scene is None:
             return "", np.inf

@@ -1,4 +1,4 @@
-"""Records what a closed loop saw, decided and did."""
+"""Records the decisions and motions of a closed loop."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Decision = Literal["go on", "replan", "brake", "wait", "stop"]
-"""What a cycle did: nothing; sent a new motion; braked on the path; stood still, since no motion
-was found yet; or gave up."""
+"""Decision of a cycle: nothing; a new motion; braking on the path; waiting at rest, since no motion
+is found yet; or giving up."""
 
 
 _SHORTEST = 1e-6  # [s] of a part of a motion
@@ -55,7 +55,7 @@ class ExecutionResult:
         reason: Why it ended without success; else "".
         cycles: All cycles.
         plans: Begin on the robot's clock [s] and plan of all motions that were sent.
-        late: Number of cycles that took longer than their period.
+        late: Number of cycles, except those at rest, that took longer than their period.
     """
 
     plan: Plan
@@ -100,7 +100,7 @@ class ExecutionResult:
         return concatenate_trajectories(parts, pause=0.0)
 
     def summary(self) -> str:
-        """Return what was decided, when and why, one decision a line."""
+        """Return the decisions with their times and reasons, one a line."""
         lines = [repr(self)]
         for cycle in self.cycles:
             if cycle.decision != "go on":

@@ -1,4 +1,4 @@
-"""Defines what the closed loop asks of a robot, and a robot that follows motions exactly."""
+"""Defines the interface of robots in the closed loop, and a robot that follows motions exactly."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class Robot(Protocol):
     def send(self, motion: Trajectory, begin: float) -> None:
         """Execute a motion whose first waypoint is due at `begin`.
 
-        Until then the robot goes on with what it was sent before. What it was sent for later is
-        discarded. Raises `InputError` if `begin` is in the past.
+        Until then the robot goes on with the motion before. Motions that were sent to begin later
+        are discarded. Raises `InputError` if `begin` is in the past.
         """
 
     def stop(self) -> None:
@@ -64,7 +64,7 @@ class IdealRobot:
 
     @property
     def motions(self) -> tuple[tuple[float, Trajectory], ...]:
-        """Begin [s] and motion of all that it was sent, as far as it was not discarded."""
+        """Begin [s] and motion of all motions that were sent and not discarded."""
         return tuple(self._motions)
 
     def read(self) -> RobotState:

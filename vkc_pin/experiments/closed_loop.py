@@ -1,4 +1,4 @@
-"""Executes plans in physics while the world differs from what was planned, open and closed loop."""
+"""Executes plans in physics in a world that differs from the plan, open and closed loop."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ TASKS = (
 ROWS: Mapping[str, str] = {
     "nothing": "the world is as planned",
     "displaced": "the object is up to 50 mm and 5° elsewhere, which is noticed at 1 m",
-    "obstacle": "something appears in the way, 1.5 m ahead of the base, and leaves a way round",
+    "obstacle": "an obstacle appears on the path, 1.5 m ahead of the base, with a motion round it",
     "person": "a person crosses the path of the base at 0.5 to 1 m/s, and is given 0.3 m of room",
     "localisation": "the base is localised 20 mm and 1° off, and drifts by 5 mm/m and 0.2°/m",
     "grasp": "the hand closes up to 8 mm and 3° off, which is noticed then",
@@ -57,7 +57,7 @@ _WIDTH = 0.2  # [m], radius of a person and of what appears
 # [m], radius of the room that a person may need before the robot has come to rest: 0.5 s at 0.6 m/s
 _ROOM = 0.5
 _HEIGHT = 1.6  # [m]
-_AWAY = -5.0  # [m], height at which an obstacle is out of the way, below the floor
+_AWAY = -5.0  # [m], height of an obstacle below the floor, where it touches nothing
 _NOTICE = 1.0  # [m] from the hand to its grasp at which an object is seen
 _FAR = 1.5  # [m] from a person to the origin of a shape; none is larger
 _BRAKING = 1.5  # [m] from the base's origin at which something may appear
@@ -77,8 +77,8 @@ class Disturbance:
 
     Attributes:
         actual: The scene as it really is, at the start.
-        observe: What is known at present: (scene, robot's clock [s], measured configuration, and
-            path length of the base so far [m]) → scene.
+        observe: Updates a scene as the robot sees the world: (scene, robot's clock [s], measured
+            configuration, path length of the base so far [m]) → scene.
         obstacle: Time [s] → centre of the moving obstacle, shape (3,); None without one.
         offset, drift: See `SimulatedRobot`.
     """
@@ -149,9 +149,9 @@ def format_results(result: Mapping[str, Any]) -> str:
         about,
         "# Plans in a world that differs",
         f"{about['starts']} random starts per row and task, seed {about['seed']}, "
-        f"{describe_limit(about)} each. Robots in physics are judged by what they really did: "
-        "goals within 10 mm and 0.02 rad, grasps that last, and no collision deeper than 1 mm with "
-        "what was not meant to be touched, while they move. Time passes for the robot while "
+        f"{describe_limit(about)} each. Robots in physics are judged by their real motions: "
+        "goals within 10 mm and 0.02 rad, grasps that last, and no collision deeper than 1 mm "
+        "that the plan does not have, while they move. Time passes for the robot while "
         "the program computes. Latencies are the median and the 95th percentile of cycles that "
         "planned again; cycles are those that kept 20 Hz.",
         "\n".join(f"- {row}: {ROWS[row]}" for row in about["rows"]),
@@ -225,7 +225,7 @@ def _make_robot(found: Plan, disturbance: Disturbance, spec: Mapping[str, Any]) 
 
 
 def _add_person(scene: Scene, radius: float) -> Scene:
-    """Return a scene with a cylinder [m] that is out of the way, below the floor."""
+    """Return a scene with a cylinder of a radius [m] below the floor."""
     person = {
         "name": _PERSON,
         "type": "cylinder",
@@ -343,7 +343,7 @@ def _obstruct(row: str, found: Plan, closing: float, rng: np.random.Generator) -
 def _appear(found: Plan, closing: float, rng: np.random.Generator) -> Disturbance:
     """Return something that appears ahead of the base, so that there still is a motion.
 
-    The robot could brake before it, and a motion is found if it is there from the start.
+    The robot could brake before it, and a motion is found if it stands there from the start.
     """
     motion = found.trajectory
     times = np.linspace(0.0, closing, 200)
@@ -358,7 +358,7 @@ def _appear(found: Plan, closing: float, rng: np.random.Generator) -> Disturbanc
         appears = float(times[last])
         there = found.scene.with_obstacle(_PERSON, [*place, _HEIGHT / 2, 0.0, 0.0, 0.0])
         if validate(there, found.steps, motion, found.options).ok:
-            continue  # it is not in the way
+            continue  # the motion does not touch it
         if plan(there, found.steps, max_evaluations=_FEW).success:
             break
     else:
@@ -384,7 +384,7 @@ def _judge(
     disturbance: Disturbance,
     result: ExecutionResult | None = None,
 ) -> dict[str, Any]:
-    """Return what a robot really did."""
+    """Judge the motion of a robot and its contacts."""
     reasons = []
     if result is not None and not result.success:
         reasons.append(result.reason)

@@ -200,9 +200,7 @@ class Plan:
         Raises:
             InputError: The plan is no success.
         """
-        if not self.success:
-            problem, expected = "this plan is no success", "a motion that is valid"
-            raise InputError(problem, field="end_scene", expected=expected, got=self.status)
+        self.check_success("end_scene")
         after = compile_each_step(self.scene, self.steps, self.options)[-1].after
         return compute_final_scene(self.scene, self.trajectory, after)
 
@@ -237,17 +235,20 @@ class Plan:
         self.check_success()
         time = self.check_time(time)
         now = self.scene_at(time) if scene is None else check_instance(scene, Scene, "scene")
-        motion = brake(self.scene, self.trajectory, time, self.options)
-        steps = list_steps_of_stop(self.scene, motion)
-        report = validate(now, steps, motion, self.options)
-        status = "success" if report.ok else "rejected"
-        return Plan(now, steps, self.options, motion, report, status, initialization="stop")
+        return self.check_stop(brake(self.scene, self.trajectory, time, self.options), now)
 
-    def check_success(self) -> None:
-        """Raise an `InputError` unless the plan is a success."""
+    def check_stop(self, motion: Trajectory, scene: Scene) -> Plan:
+        """Return a braking motion, see `stopping.brake`, as a plan validated in a scene."""
+        steps = list_steps_of_stop(self.scene, motion)
+        report = validate(scene, steps, motion, self.options)
+        status = "success" if report.ok else "rejected"
+        return Plan(scene, steps, self.options, motion, report, status, initialization="stop")
+
+    def check_success(self, field: str = "plan") -> None:
+        """Raise an `InputError` about a field unless the plan is a success."""
         if not self.success:
             problem, expected = "this plan is no success", "a motion that is valid"
-            raise InputError(problem, field="plan", expected=expected, got=self.status)
+            raise InputError(problem, field=field, expected=expected, got=self.status)
 
     def check_time(self, time: float) -> float:
         """Return a checked time of the motion [s].

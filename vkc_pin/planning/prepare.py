@@ -158,11 +158,9 @@ def prepare(
             problem = "cannot be combined with `simultaneous=False`"
             raise InputError(problem, field="window", expected="None", got=window)
     steps = as_steps(steps)
-    prepared = PreparedTask(
-        scene, steps, options, trace_terms(scene, terms), simultaneous, window, planner
-    )
-    prepared.compile(scene)
-    return prepared
+    traced = trace_terms(scene, terms)
+    tasks = _compile(scene, steps, options, traced, each=window is not None)
+    return PreparedTask(scene, steps, options, traced, simultaneous, window, planner, tasks)
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,6 +171,7 @@ class PreparedTask:
         scene: Scene in which they were checked.
         steps, options, terms, simultaneous, window: See `plan`.
         planner: Planner whose caches are used; None: the process's own.
+        tasks: The task of all steps in this scene, or with a window those of all actions.
     """
 
     scene: Scene
@@ -182,7 +181,7 @@ class PreparedTask:
     simultaneous: bool
     window: int | None
     planner: Planner | None
-    _compiled: dict[str, tuple[Scene, list[Task]]] = field(default_factory=dict, repr=False)
+    tasks: Sequence[Task] = field(repr=False)
 
     def solve(
         self,
@@ -237,12 +236,12 @@ class PreparedTask:
             budget.activate(),
         ):
             request = dataclasses.replace(request, progress=line, cache=cache, explains=explain)
-            tasks = self.compile(scene)
+            tasks = self._compile(scene)
             holds = [hold for task in tasks for hold in task.holds if hold.by is not None]
             # Attachments approached from inside the object are reversed, with a warning.
             ready = scene.with_approaches(dict.fromkeys(holds), stacklevel=4)
             if ready is not scene:
-                tasks = self.compile(ready)
+                tasks = self._compile(ready)
             search = functools.partial(self._search, ready, tasks)
             found = _search_repeatedly(search, request, budget)
             found = _add_note_on_ending(found, budget)
@@ -250,27 +249,13 @@ class PreparedTask:
             line.end(found)
         return found
 
-    def compile(self, scene: Scene) -> list[Task]:
-        """Return the task of all steps in a scene, or with a window the task of every action.
+    def _compile(self, scene: Scene) -> Sequence[Task]:
+        if scene is self.scene:
+            return self.tasks
+        each = self.window is not None
+        return _compile(scene, self.steps, self.options, self.terms, each=each)
 
-        Raises:
-            InputError: The steps or terms are impossible there.
-        """
-        known = self._compiled.get("last")
-        if known is not None and known[0] is scene:
-            return known[1]
-        if self.window is None:
-            tasks = [compile_task(scene, self.steps, self.options)]
-        else:
-            tasks = compile_each_step(scene, self.steps, self.options)
-        spans = [span for task in tasks for span in summarize_phases(task)]
-        check_terms_active(self.terms, spans)
-        check_footings(scene, tasks)
-        check_loads(scene, tasks, self.options)
-        self._compiled["last"] = scene, tasks
-        return tasks
-
-    def _search(self, scene: Scene, tasks: list[Task], request: PlanningRequest) -> Plan:
+    def _search(self, scene: Scene, tasks: Sequence[Task], request: PlanningRequest) -> Plan:
         """Plan the steps once."""
         if self.window is not None:
             return plan_with_window(scene, self.steps, self.window, request)
@@ -282,6 +267,29 @@ class PreparedTask:
         if request.guess is not None:
             return _plan_from_guess(scene, task, request)
         return _plan_as_one_problem(scene, task, request)
+
+
+def _compile(
+    scene: Scene,
+    steps: tuple[Step, ...],
+    options: Options,
+    terms: tuple[Term, ...],
+    *,
+    each: bool,
+) -> Sequence[Task]:
+    """Return the checked task of all steps in a scene, or with `each` the task of every action.
+
+    Raises:
+        InputError: The steps or terms are impossible there.
+    """
+    if each:
+        tasks = compile_each_step(scene, steps, options)
+    else:
+        tasks = [compile_task(scene, steps, options)]
+    check_terms_active(terms, [span for task in tasks for span in summarize_phases(task)])
+    check_footings(scene, tasks)
+    check_loads(scene, tasks, options)
+    return tasks
 
 
 def _plan_as_one_problem(scene: Scene, task: Task, request: PlanningRequest) -> Plan:

@@ -48,7 +48,7 @@ def replan(
         state: Measured configuration of the robot at that time, shape (n,). Default: the scene's.
         velocity: Measured velocity of the robot, shape (n,), [m/s] and [rad/s], or coordinate →
             velocity. Default: the scene's.
-        scene: The world as it is at that time: `plan.scene_at(time)`, changed by what was measured.
+        scene: The world at that time: `plan.scene_at(time)`, with measured placements.
             Default: that scene itself. If an object that the hand holds is elsewhere than planned,
             its grasp counts as measured there.
         time_limit: Wall-clock limit [s]; see `plan`. If there is one, a failure is not explained,

@@ -17,8 +17,8 @@ from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import find_phase_at
 
 _STEP = 5e-3  # [s] of the motion's time between knots of the braking motion
-# Share of the acceleration limits that is used: between knots, a cubic may exceed what it has
-# there a little.
+# Share of the acceleration limits that is used: between knots, a cubic may exceed its accelerations
+# at the knots a little.
 _SHARE = 0.97
 _SLOW = 1e-9  # [m/s] or [rad/s] below which a coordinate does not bound the braking
 _REST = 2e-3  # [s], duration of a stop of a motion that rests already
@@ -59,9 +59,9 @@ def brake(scene: Scene, motion: Trajectory, time: float, options: Options) -> Tr
         braking = _find_least(factors, offsets, np.concatenate([limit, limit]))
         next_square = square + 2.0 * braking * duration
         if next_square <= 0.0:
-            way = -square / (2.0 * braking)
-            if way > _SLOW:
-                clocks.append(float(places[k]) + way)
+            distance = -square / (2.0 * braking)
+            if distance > _SLOW:
+                clocks.append(float(places[k]) + distance)
                 squares.append(0.0)
             squares[-1] = 0.0
             break

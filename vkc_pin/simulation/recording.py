@@ -1,4 +1,4 @@
-"""Records what a simulated robot and the objects around it really do."""
+"""Records the motions of a simulated robot and of the objects around it."""
 
 from __future__ import annotations
 

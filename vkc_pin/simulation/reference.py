@@ -35,9 +35,9 @@ class Segment:
 
 
 class Reference:
-    """What a robot is to do, from its rest in the start of a scene on.
+    """The motions that a robot is sent, from its rest in the start of a scene on.
 
-    Holds are the same, whatever their deviations: these tell what a planner knows of a grasp.
+    Holds are the same, whatever their deviations: these are measurements of a grasp.
 
     Attributes:
         segments: Motions, each of which takes over from the one before.

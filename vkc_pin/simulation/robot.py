@@ -90,7 +90,7 @@ class SimulatedRobot:
         delay: Time from a measurement until it is read [s].
         seed: Seed of the noise.
         base_offset: Bias of the base's localisation at the start: x, y [m], yaw [rad].
-        base_drift: What is added to it per metre of travel: x, y [m/m], yaw [rad/m].
+        base_drift: Increase of this bias per metre of travel: x, y [m/m], yaw [rad/m].
         counts_planning: Whether the time that the program takes between two calls passes for the
             robot, too. If not, planning takes no time, and executions are reproducible.
 
@@ -197,8 +197,8 @@ class SimulatedRobot:
             begin: Time at which its first waypoint is due [s].
 
         Raises:
-            InputError: `begin` is over, the motion is one of another robot or holds what is not
-                in the scene, or the integration diverged.
+            InputError: `begin` is over, the motion is one of another robot or holds an object
+                that is not in the scene, or the integration diverged.
         """
         check_instance(motion, Trajectory, "motion")
         begin = check_number(begin, "begin", "a time [s]")
@@ -259,7 +259,7 @@ class SimulatedRobot:
         return self._recording.get_object_states(row)
 
     def trajectory(self) -> Trajectory:
-        """Return what the robot really did until now, each 10 ms, with the times of its clock.
+        """Return the motion of the robot until now, each 10 ms, with the times of its clock.
 
         It has the coordinates of all motions; freedoms of grasps are as planned.
 
@@ -369,9 +369,9 @@ class SimulatedRobot:
         self._stepper.grips.reschedule(spans, last)
 
     def _balance_load(self) -> Floats:
-        """Return the displacement of each servo's command that carries what is held at the start.
+        """Return the displacements of servo commands that carry the grasped objects at the start.
 
-        Its shape is (servos,), [m] and [rad].
+        Their shape is (servos,), [m] and [rad].
         """
         self._stepper.switch(self._clock)
         _, commands = self._compute_commands(np.array([self._clock]))

@@ -40,7 +40,7 @@ _BALANCE_ROUNDS = 8
 def silence_warnings() -> Iterator[None]:
     """Let MuJoCo write no log file into the working directory, as it does by default.
 
-    What it warns of is found by `Stepper.has_diverged`.
+    `Stepper.has_diverged` finds the causes of its warnings.
     """
     mujoco = import_mujoco()
     mujoco.set_mju_user_warning(lambda text: None)
@@ -223,7 +223,7 @@ class Stepper:
         return is_reset or not np.isfinite(data.qpos).all()
 
     def balance_load(self, robot_size: int) -> Floats:
-        """Make the robot carry from the beginning what it holds at the start.
+        """Make the robot carry from the beginning the objects that it grasps at the start.
 
         Servos and welds give way under load, and the plan begins where they have done so. They
         would give way once more at every continuation of an execution. A motor at rest carries its

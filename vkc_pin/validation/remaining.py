@@ -1,4 +1,4 @@
-"""Checks what is left of a motion after obstacles have moved."""
+"""Checks the rest of a motion after obstacles have moved."""
 
 from __future__ import annotations
 

@@ -8,7 +8,6 @@ import pinocchio as pin
 import pytest
 from helpers.memory import measure_growth
 
-from vkc_pin.planning.chain.kinematic_tree import flatten_placement
 from vkc_pin.planning.chain.pose import (
     POSE_OFFSET_SIZE,
     ROW_BOUNDS,
@@ -17,6 +16,7 @@ from vkc_pin.planning.chain.pose import (
     compute_pose_offsets,
     relax_target,
 )
+from vkc_pin.world.collision.solids import flatten_placements
 
 KINDS = ("pose", "point", "upright", "level")
 ANGLES = [0.0, 1e-9, 1e-6, 1e-3, 0.5, np.pi / 2, 2.5, *(np.pi - x for x in (1e-2, 1e-3, 1e-6, 0))]
@@ -45,7 +45,7 @@ SLOPES = {
 
 
 def evaluate(function: ca.Function, placement: pin.SE3, target: pin.SE3) -> np.ndarray:
-    found = function(placement.rotation, placement.translation, flatten_placement(target))
+    found = function(placement.rotation, placement.translation, flatten_placements([target])[0])
     return np.asarray(found).ravel()
 
 
@@ -104,7 +104,7 @@ def test_newton_steps_lead_away_from_half_turns(kind: str, axis: int) -> None:
     target, rng = pin.SE3.Random(), np.random.default_rng(2)
     placement = turn(kind, target, np.pi, rng, np.eye(3)[axis] if kind == "pose" else None)
     for _ in range(15):
-        at = (placement.rotation, placement.translation, flatten_placement(target))
+        at = (placement.rotation, placement.translation, flatten_placements([target])[0])
         slope = np.asarray(SLOPES[kind](*at, np.zeros(3)))[3:, 3:]
         residual = evaluate(RESIDUALS[kind], placement, target)[3:]
         step = -np.linalg.lstsq(slope, residual, rcond=1e-6)[0]
@@ -131,7 +131,7 @@ RELAX = ca.Function(
 
 
 def relax(target: pin.SE3, offset: np.ndarray, relaxation: float) -> pin.SE3:
-    vector = np.asarray(RELAX(flatten_placement(target), offset, relaxation)).ravel()
+    vector = np.asarray(RELAX(flatten_placements([target])[0], offset, relaxation)).ravel()
     return pin.SE3(vector[:9].reshape(3, 3).T, vector[9:])
 
 

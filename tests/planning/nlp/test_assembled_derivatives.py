@@ -158,7 +158,7 @@ def test_assembled_derivatives_equal_those_of_casadi(structure: Structure, seed:
     compare = ca.Function("compare", list(symbols.values()), [*found, *expected])
     rng = np.random.default_rng(seed)
     values = {name: rng.uniform(0.2, 1.0, symbol.shape) for name, symbol in symbols.items()}
-    values["mounts"] = structure.tree.mounts  # whose rotations are rotations
+    values["mounts"] = structure.tree.mounts.T  # whose rotations are rotations
     point = list(values.values())
     matrices = [np.asarray(matrix) for matrix in compare(*point)]
     for one, other in zip(matrices[:3], matrices[3:], strict=True):

@@ -22,11 +22,11 @@ from helpers.telescopes import write_coupled_scene
 
 import vkc_pin as vkc
 from vkc_pin.options import Options
-from vkc_pin.planning.chain.kinematic_tree import flatten_placement
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.nlp.transcription import transcribe
 from vkc_pin.planning.nlp.waypoint import Structure
 from vkc_pin.utils.cache import Cache
+from vkc_pin.world.collision.solids import flatten_placements
 from vkc_pin.world.models.robot_file import load_robot
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Actuate, GoTo, Grasp, Place, Reach, Release, Touch
@@ -91,7 +91,7 @@ def iterate_waypoint_rows(point: ProgramPoint) -> Iterator[tuple[np.ndarray, np.
     data = model.createData()
     for k, q in enumerate(p.chain.coordinates.q(point.z)):
         pin.forwardKinematics(model, data, q)
-        stacked = np.concatenate([flatten_placement(M) for M in list(data.oMi)[1:]])
+        stacked = flatten_placements(list(data.oMi)[1:]).ravel()
         yield t.slot_rows[k], point.planes[k] @ stacked - point.offsets[k] + point.slack[k]
         for number, (pose, at) in enumerate(zip(t.structure.poses, t.pose_rows, strict=True)):
             assert (k + 1 in at) == (k + 1 in pose.waypoints)

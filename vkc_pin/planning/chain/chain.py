@@ -212,10 +212,6 @@ class VirtualKinematicChain:
         """Kinematics, stored here because a cache lookup takes as long as an evaluation."""
         return get_kinematics(self.tree, self.cache)
 
-    @cached_property
-    def _flat_mounts(self) -> Floats:
-        return self.tree.mounts.ravel(order="F")
-
     def joint_placements(self, z: Floats) -> tuple[Floats, Floats]:
         """Return the world placements of all joints at z, shape (W, n); joint 0 is the world.
 
@@ -224,7 +220,7 @@ class VirtualKinematicChain:
         """
         batch = len(z)
         joints = self.model.njoints
-        (placements,) = self._kinematics.batch(z, self._flat_mounts)
+        (placements,) = self._kinematics.batch(z, self.tree.mounts.ravel())
         placements = placements.reshape(batch, joints - 1, 12)
         rotations = np.zeros((batch, joints, 3, 3))
         rotations[:, 0] = np.eye(3)

@@ -6,12 +6,13 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.planning.chain.kinematic_tree import KinematicTree, flatten_placement, get_kinematics
+from vkc_pin.planning.chain.kinematic_tree import KinematicTree, get_kinematics
 from vkc_pin.planning.chain.pose import PoseRow, build_pose_residual
 from vkc_pin.planning.kinematics.batch import BatchFunction
 from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.utils.budget import record_evaluations
 from vkc_pin.utils.cache import Cache
+from vkc_pin.world.collision.solids import flatten_placements
 
 MAX_STEP = 0.5  # [m] or [rad]: maximum Gauss-Newton step of a coordinate
 
@@ -80,7 +81,7 @@ class PoseSolver:
         self._functions = get_pose_functions(tree, pose, cache)
         self.size = self._functions.size
         self.rows = self._functions.rows
-        self._data = flatten_placement(local), tree.mounts.ravel(order="F")
+        self._data = flatten_placements([local]), tree.mounts.ravel()
 
     def evaluate(self, z: Floats, target: pin.SE3) -> tuple[Floats, Floats]:
         """Return the pose residuals and their Jacobians at `z`.
@@ -92,7 +93,7 @@ class PoseSolver:
         Returns:
             Residuals, shape (B, m), [m] and [rad], and Jacobians, shape (B, m, n).
         """
-        residual, jacobian = self._functions.residual(z, flatten_placement(target), *self._data)
+        residual, jacobian = self._functions.residual(z, flatten_placements([target]), *self._data)
         columns = jacobian.reshape(len(z), self.size, self.rows)
         return residual, columns.swapaxes(1, 2)
 
@@ -122,7 +123,7 @@ class PoseSolver:
             Configurations, shape (B, n), and a mask of those that satisfy the pose, shape (B,).
         """
         z = np.clip(z, lower, upper)
-        data = (flatten_placement(target), *self._data)
+        data = (flatten_placements([target]), *self._data)
         errors = np.empty(len(z))
         # Indices of unsolved configurations; their values and limits.
         unsolved = np.arange(len(z))

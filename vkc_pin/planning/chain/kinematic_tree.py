@@ -14,12 +14,8 @@ from vkc_pin.planning import kinematics as cpin
 from vkc_pin.planning.kinematics.batch import BatchFunction, estimate_size
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.cache import Cache
+from vkc_pin.world.collision.solids import flatten_placements
 from vkc_pin.world.models.coordinates import Coordinates
-
-
-def flatten_placement(placement: pin.SE3) -> Floats:
-    """Return a placement as 12 numbers: R column by column and p [m]."""
-    return np.concatenate([placement.rotation.T.ravel(), placement.translation])
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +42,7 @@ class KinematicTree:
 
     @property
     def mount_count(self) -> int:
-        """Number of columns of the functions' argument, at least one."""
+        """Number of placements in the functions' argument, at least one."""
         return max(len(self.mounted), 1)
 
     @cached_property
@@ -62,14 +58,13 @@ class KinematicTree:
 
     @cached_property
     def mounts(self) -> Floats:
-        """Placements of the mounted joints on their parents, shape (12, m), m at least 1.
+        """Placements of the mounted joints on their parents, shape (m, 12), m at least 1.
 
-        Columns are as in `cpin.joint_placements`; without mounted joints there is one of zeros.
+        Rows are as of `flatten_placements`; without mounted joints there is one of zeros.
         """
-        columns = np.zeros((12, self.mount_count))
-        for column, joint in enumerate(self.mounted):
-            columns[:, column] = flatten_placement(self.model.jointPlacements[joint])
-        return columns
+        if not self.mounted:
+            return np.zeros((1, 12))
+        return flatten_placements([self.model.jointPlacements[joint] for joint in self.mounted])
 
 
 class Kinematics:
@@ -84,7 +79,7 @@ class Kinematics:
 
         Args:
             z: Symbols of the coordinates, shape (n, 1).
-            mounts: Symbols of `KinematicTree.mounts`.
+            mounts: Symbols of `KinematicTree.mounts`, one column each, shape (12, m).
         """
         inputs = [self._tree.coordinates.q_symbolic(z)]
         if self._tree.mounted:

@@ -14,7 +14,6 @@ from vkc_pin.options import Options
 from vkc_pin.planning.chain.chain import VirtualKinematicChain, consolidate
 from vkc_pin.planning.chain.contacts import ContactModel, Contacts
 from vkc_pin.planning.chain.inverse_kinematics import PoseSolver
-from vkc_pin.planning.chain.kinematic_tree import flatten_placement
 from vkc_pin.planning.chain.pose import ROW_BOUNDS
 from vkc_pin.planning.nlp.objective import MotionCost
 from vkc_pin.planning.nlp.pose_goals import (
@@ -38,6 +37,7 @@ from vkc_pin.planning.nlp.waypoint import Structure
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.cache import Cache
 from vkc_pin.validation.tolerances import Tolerances
+from vkc_pin.world.collision.solids import flatten_placements
 from vkc_pin.world.models.coordinates import wrap_angle
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
@@ -387,7 +387,7 @@ class TrajectoryProblem:
             return np.zeros(0)
         gears = self.rolling.compute_gears(self.waypoints(z))
         values = t.relaxed_row_values(
-            t.pack(z), self.start, timing.dt, gears, self.chain.tree.mounts
+            t.pack(z), self.start, timing.dt, gears, self.chain.tree.mounts.T
         )
         values = np.asarray(values).ravel()
         lower, upper = self.row_bounds(timing if rates else None)
@@ -459,8 +459,8 @@ class TrajectoryProblem:
             "start": self.start,
             "end_steps": compute_end_steps(self.end_velocities, dt),
             "dt": dt,
-            "targets": np.array([flatten_placement(goal.target) for goal in self.pose_goals]),
-            "frames": np.array([flatten_placement(goal.local) for goal in self.pose_goals]),
+            "targets": flatten_placements([goal.target for goal in self.pose_goals]),
+            "frames": flatten_placements([goal.local for goal in self.pose_goals]),
             "mounts": self.chain.tree.mounts,
             "step_weights": step_weights,
             "change_weights": change_weights,

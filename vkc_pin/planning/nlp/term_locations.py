@@ -10,11 +10,11 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError
 from vkc_pin.planning.chain.chain import VirtualKinematicChain
-from vkc_pin.planning.chain.kinematic_tree import flatten_placement
 from vkc_pin.planning.nlp.pose_goals import find_phase_spans
 from vkc_pin.planning.nlp.term_rows import FrameLocation, TermLocation, TermRow, Tree, Value
 from vkc_pin.planning.nlp.transcription import Transcription
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.collision.solids import flatten_placements
 from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Task, summarize_phases
@@ -125,7 +125,8 @@ class _FrameLocator:
 
 
 def _flatten_placement(placement: pin.SE3) -> tuple[float, ...]:
-    return tuple(flatten_placement(placement).tolist())
+    (row,) = flatten_placements([placement]).tolist()
+    return tuple(row)
 
 
 class TermEvaluator:
@@ -235,6 +236,6 @@ class TermEvaluator:
         """Return values and Jacobian of the constraints, and sum and gradient of the costs."""
         x = self.transcription.pack(z)
         values, jacobian, cost, gradient = self.transcription.term_values(
-            x, self.start, dt, self.mounts
+            x, self.start, dt, self.mounts.T
         )
         return np.asarray(values).ravel(), jacobian, float(cost), np.asarray(gradient.nonzeros())

@@ -115,12 +115,7 @@ class Transcription:
                 - gears: Gear of a wheeled base in each step, shape (N,).
                 - dt: Step durations, shape (N,) [s].
         """
-        columns = {
-            "planes": (0, 2, 1),
-            "step_weights": (1, 0),
-            "change_weights": (1, 0),
-            "mounts": (1, 0),
-        }
+        columns = {"planes": (0, 2, 1), "step_weights": (1, 0), "change_weights": (1, 0)}
         parts = []
         for name, symbol in self.parameter_symbols.items():
             value = np.asarray(values.get(name, ()))

@@ -295,7 +295,7 @@ def compute_final_scene(scene: Scene, trajectory: Trajectory, holds: Sequence[Ho
 
 
 def compute_scene_at(scene: Scene, trajectory: Trajectory, time: float) -> Scene:
-    """Compute the scene at a time of a motion [s], with what is held there.
+    """Compute the scene at a time of a motion [s], with the objects grasped then.
 
     While the gripper closes or opens between two phases, it is the scene before it did.
     """

@@ -119,6 +119,25 @@ def test_robot_brakes_before_a_wall_and_gives_up() -> None:
     check_smooth(robot, result)
 
 
+def test_plan_from_rest_keeps_the_terms_of_the_user() -> None:
+    """Somebody stands on the path for a while: the robot brakes, and goes on later."""
+    elbow = vkc.Cost("elbow", lambda s: (s.coordinate("elbow_joint") - 1.5) ** 2, weight=0.1)
+    plan = vkc.plan(plan_door().scene, plan_door().steps, terms=[elbow])
+    assert plan.success, plan.summary()
+    robot = IdealRobot(plan.scene, is_simulated=True)
+    x, y = plan.trajectory.at(2.0)[:2]
+
+    def observe(scene: vkc.Scene) -> vkc.Scene:
+        is_there = 1.0 < robot.time < 2.5
+        place = [x, y] if is_there else [0.95, 0.85]
+        return scene.with_obstacle("stool", [*place, 0.225, 0.0, 0.0, 0.0])
+
+    result = execute(plan, robot, observe=observe, lead=0.5, time_limit=1e-3)
+    assert result.success, result.summary()
+    assert "brake" in result.count_decisions()
+    assert result.plans[-1][1].terms == plan.terms
+
+
 def test_robot_off_its_motion_is_brought_back() -> None:
     class Drifting(IdealRobot):
         """A robot that is 50 mm off for a while, by its own measurement."""

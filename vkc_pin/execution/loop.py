@@ -294,6 +294,7 @@ class _Loop:
                 scene,
                 steps,
                 options=self._first.options,
+                terms=self._first.terms,
                 planner=self._planner,
             )
         except InputError as impossible:

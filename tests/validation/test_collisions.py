@@ -180,17 +180,25 @@ def test_closest_pair_of_every_waypoint_is_found() -> None:
     with_others = np.flatnonzero(robots[table.pairs].sum(axis=1) == 1)
     table.pairs, table.margins = table.pairs[with_others], table.margins[with_others]
     least = np.full(len(z), np.inf)
-    for hit in sweep(table, z, np.arange(len(z))):
+    for hit in list_hits(table, z, np.arange(len(z))):
         if hit.at_waypoint:
             least[hit.row] = min(least[hit.row], hit.distance)
     np.testing.assert_allclose(least, compute_all_distances(table, z).min(axis=1), atol=1e-5)
     assert least.min() < 0.0 < 10.0 < least.max()
 
 
+def list_hits(table: PairTable, z: np.ndarray, waypoints: np.ndarray) -> list[Hit]:
+    """Return all hits of a sweep."""
+    listed: list[Hit] = []
+    for hits in sweep(table, z, waypoints):
+        listed += hits.to_list(np.ones(len(hits.rows), bool))
+    return listed
+
+
 def sweep_motion(scene: Scene, motion: Trajectory) -> tuple[PairTable, Samples, list[Hit]]:
     samples = Samples(scene, motion)
     table = PairTable(scene, CollisionShapes(samples.world), motion, 0.02, samples=samples)
-    return table, samples, list(sweep(table, samples.z, samples.waypoint_rows))
+    return table, samples, list_hits(table, samples.z, samples.waypoint_rows)
 
 
 def check_sweep(scene: Scene, motion: Trajectory) -> None:
@@ -243,7 +251,7 @@ def test_no_penetration_is_missed_between_sparse_samples(seed: int, size: float)
     samples, table = Samples(door, motion), make_table(door, motion)
     found = {
         (hit.row, hit.first, hit.second)
-        for hit in sweep(table, samples.z[samples.waypoint_rows], np.arange(4))
+        for hit in list_hits(table, samples.z[samples.waypoint_rows], np.arange(4))
         if hit.distance < 0
     }
     distances = compute_all_distances(table, samples.z)
@@ -274,7 +282,7 @@ def test_windows_permit_contact_but_no_crossing(
     if overlap is not None:
         near = [Window(pairs, 0, last, 0.0, overlap, together)]
     table = make_table(scene, motion, *near)
-    hits = list(sweep(table, world.compute_positions(motion), np.arange(len(motion.times))))
+    hits = list_hits(table, world.compute_positions(motion), np.arange(len(motion.times)))
     assert all(hit.distance > 0.0 for hit in hits if hit.at_waypoint and hit.second == "fence")
     through = {hit.first for hit in hits if hit.second == "fence" and hit.distance < -5e-4}
     permitted = together and not before  # like a hand and the grasped object until its release
@@ -332,7 +340,9 @@ def test_thin_shapes_that_pass_each_other_between_two_samples_are_found(part: fl
     scene = Scene.from_document(document)
     phase = PhaseSpan("all", 0, 1, (Hold("blade", "grip"),))
     motion = make_object_motion(scene, "blade", phase, slide=[0.0, 0.2])
-    hits = sweep(make_table(scene, motion), World(scene).compute_positions(motion), np.arange(2))
+    hits = list_hits(
+        make_table(scene, motion), World(scene).compute_positions(motion), np.arange(2)
+    )
     found = [hit for hit in hits if (hit.first, hit.second) == ("blade.blade", "board")]
     assert min(hit.distance for hit in found) < 0.0
     assert {hit.row for hit in found if hit.distance < 0.0 and not hit.at_waypoint} == {0}

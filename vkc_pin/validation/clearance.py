@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import bisect
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
 from vkc_pin.options import Options
 from vkc_pin.utils.arrays import Bools, Floats, Ints
-from vkc_pin.validation.collisions import Hit, PairTable, sweep
+from vkc_pin.validation.collisions import Hit, Hits, PairTable, sweep
 from vkc_pin.validation.contact_windows import find_contact_windows
 from vkc_pin.validation.distances import CollisionShapes, bound_displacements
 from vkc_pin.validation.neighbours import ExemptPairs, find_exempt_pairs
@@ -32,13 +31,35 @@ class ClearanceResult:
     def __init__(self, samples: Samples) -> None:
         self._samples = samples
         self._lasts = [phase.last for phase in samples.trajectory.phases]
-        self._waypoint_rows = samples.waypoint_rows.tolist()
         # The worst hit of each constraint and pair of links, with the amount of its violation.
         self._worst: dict[tuple[str, str, str], tuple[Hit, float]] = {}
         self.smallest = np.full(len(self._lasts), np.inf)
         self.exemptions: dict[tuple[str, str], Exemption] = {}
 
-    def add(self, hit: Hit, exempt: Sequence[ExemptPairs]) -> None:
+    def add(
+        self,
+        hits: Hits,
+        exemptions: Mapping[tuple[int, int], Sequence[ExemptPairs]],
+        have_exemptions: Bools,
+    ) -> None:
+        """Judge distances of pairs.
+
+        Args:
+            hits: The distances.
+            exemptions: Exemptions of two shapes.
+            have_exemptions: Which pairs of the table have some, shape (P,).
+        """
+        required = np.zeros(len(hits.rows))
+        if hits.at_waypoints:
+            clearances = np.maximum(hits.margins, hits.exempt_clearances)
+            required = np.maximum(clearances - ACCEPTED_SHORTFALL, 0.0)
+        is_clear = ~have_exemptions[hits.pairs] & (hits.distances >= required)
+        counts = is_clear & (hits.margins > -np.inf)
+        self._add_distances(hits.rows[counts], hits.distances[counts])
+        for hit in hits.to_list(~is_clear):
+            self._judge(hit, exemptions.get(hit.shapes, []))
+
+    def _judge(self, hit: Hit, exempt: Sequence[ExemptPairs]) -> None:
         """Judge the distance of a pair, with the exemptions of the pair."""
         # The exemption also covers the segment before it ends and the one after it begins.
         state = self._samples.z[[hit.row]]
@@ -52,7 +73,7 @@ class ClearanceResult:
             contact = max(contact, CONTACT_DEPTH + tolerated)
             margin = min(margin, -tolerated)
         elif hit.margin > -np.inf:
-            self._add_distance(hit)
+            self._add_distances(np.array([hit.row]), np.array([hit.distance]))
         is_checked = hit.at_waypoint and hit.row > 0
         shortfall = margin - ACCEPTED_SHORTFALL - hit.distance
         if hit.distance < -contact:
@@ -64,10 +85,10 @@ class ClearanceResult:
         ):
             self._add_exemption(hit, exempt)
 
-    def _add_distance(self, hit: Hit) -> None:
-        waypoint = bisect.bisect_right(self._waypoint_rows, hit.row) - 1
-        phase = bisect.bisect_left(self._lasts, waypoint)
-        self.smallest[phase] = min(self.smallest[phase], hit.distance)
+    def _add_distances(self, rows: Ints, distances: Floats) -> None:
+        waypoints = np.searchsorted(self._samples.waypoint_rows, rows, side="right") - 1
+        phases = np.searchsorted(self._lasts, waypoints)
+        np.minimum.at(self.smallest, phases, distances)
 
     def _add_violation(self, kind: str, hit: Hit, amount: float) -> None:
         key = (kind, hit.first, hit.second)
@@ -169,10 +190,11 @@ class ClearanceCheck:
         for one in find_exempt_pairs(scene, solids, dist_safe, obstacles_only=obstacles_only):
             for first, second in one.pairs.tolist():
                 exemptions.setdefault((first, second), []).append(one)
+        have_exemptions = _are_listed(table.pairs, exemptions)
         deepest_only = None
         if obstacles_only:
             # Where a pair may overlap for a while, its deepest overlap need not be a violation.
-            deepest_only = ~(table.have_windows | _are_listed(table.pairs, exemptions))
+            deepest_only = ~(table.have_windows | have_exemptions)
         result = ClearanceResult(samples)
         hits = sweep(
             table,
@@ -182,8 +204,8 @@ class ClearanceCheck:
             first_row=first_row,
             deepest_only=deepest_only,
         )
-        for hit in hits:
-            result.add(hit, exemptions.get(hit.shapes, []))
+        for found in hits:
+            result.add(found, exemptions, have_exemptions)
         return result
 
 

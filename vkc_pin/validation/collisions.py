@@ -8,6 +8,7 @@ All remaining intervals are evaluated at once, then all their halves, and so on.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -272,8 +273,47 @@ class Hit(NamedTuple):
     margin: float
     contact: float
     at_waypoint: bool
-    exempt_clearance: float = 0.0
-    shapes: tuple[int, int] = (-1, -1)
+    exempt_clearance: float
+    shapes: tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """The distances of H pairs, all at waypoints or all elsewhere; see `Hit`.
+
+    Attributes:
+        rows, distances, margins, contacts, exempt_clearances: Shape (H,) each.
+        pairs: Indices of the pairs in the table, shape (H,).
+    """
+
+    table: PairTable
+    rows: Ints
+    pairs: Ints
+    distances: Floats
+    margins: Floats
+    contacts: Floats
+    exempt_clearances: Floats
+    at_waypoints: bool
+
+    def to_list(self, which: Bools) -> list[Hit]:
+        """Return those distances of a mask, shape (H,), as objects."""
+        labels = self.table.world.collision_labels
+        listed: list[Hit] = []
+        for n in np.flatnonzero(which).tolist():
+            i, j = self.table.pairs[self.pairs[n]].tolist()
+            hit = Hit(
+                row=int(self.rows[n]),
+                first=labels[i],
+                second=labels[j],
+                distance=float(self.distances[n]),
+                margin=float(self.margins[n]),
+                contact=float(self.contacts[n]),
+                at_waypoint=self.at_waypoints,
+                exempt_clearance=float(self.exempt_clearances[n]),
+                shapes=(i, j),
+            )
+            listed.append(hit)
+        return listed
 
 
 def sweep(
@@ -284,7 +324,7 @@ def sweep(
     moved: Floats | None = None,
     first_row: int = 0,
     deepest_only: Bools | None = None,
-) -> Iterator[Hit]:
+) -> Iterator[Hits]:
     """Yield close pairs along a motion: first those at waypoints, then those between them.
 
     Args:
@@ -319,7 +359,7 @@ class _Sweep:
         if deepest_only is not None:
             self._deepest_only = deepest_only
 
-    def find_hits(self, z: Floats, moved: Floats) -> Iterator[Hit]:
+    def find_hits(self, z: Floats, moved: Floats) -> Iterator[Hits]:
         waypoints = self._waypoints
         placed = self._place(z[waypoints])
         at, pairs, distances = self._find_nearest(placed)
@@ -331,8 +371,8 @@ class _Sweep:
         self._select_overlaps(waypoints[at], pairs, distances)
         is_close = distances < np.maximum(margins, 0.0)
         chosen = np.union1d(closest, np.flatnonzero(is_close | is_exempt))
-        yield from self._make_hits(
-            waypoints[at[chosen]], pairs[chosen], distances[chosen], at_waypoint=True
+        yield self._make_hits(
+            waypoints[at[chosen]], pairs[chosen], distances[chosen], at_waypoints=True
         )
         # Pairs that stay further apart do not affect the report.
         smallest = RESOLUTION
@@ -353,7 +393,7 @@ class _Sweep:
 
     def _search_intervals(
         self, z: Floats, todo: Intervals, moved: Floats, smallest: float
-    ) -> Iterator[Hit]:
+    ) -> Iterator[Hits]:
         """Bisect intervals and yield pairs that come closer than `smallest` inside of them.
 
         Every state s in between satisfies d(s) ≥ (d_t + d_{t+1} − relative motion) / 2, so that
@@ -378,7 +418,7 @@ class _Sweep:
             chosen = self._select_overlaps(middle, todo.pair, distances)
             if not self._close_only:
                 chosen = np.union1d(_find_group_minima(at, distances), chosen)
-            yield from self._make_hits(middle[chosen], todo.pair[chosen], distances[chosen])
+            yield self._make_hits(middle[chosen], todo.pair[chosen], distances[chosen])
             todo = Intervals(
                 np.append(todo.low, middle),
                 np.append(middle, todo.high),
@@ -406,7 +446,7 @@ class _Sweep:
         second_motion = moved[todo.high, second] - moved[todo.low, second]
         return first_motion + second_motion
 
-    def _find_tunnelling(self, z: Floats, todo: Intervals, moved: Floats) -> Iterator[Hit]:
+    def _find_tunnelling(self, z: Floats, todo: Intervals, moved: Floats) -> Iterator[Hits]:
         """Yield pairs that overlap between two adjacent samples, but at neither of them.
 
         Penetrations deeper than `RESOLUTION` are never missed.
@@ -438,7 +478,7 @@ class _Sweep:
             placed = self._place((1 - fraction) * z[rows] + fraction * z[rows + 1])
             pairs = self._table.pairs[todo.pair[which]]
             distances = placed.compute_distances(at.ravel(), pairs)
-            yield from self._make_hits(todo.low[which], todo.pair[which], distances)
+            yield self._make_hits(todo.low[which], todo.pair[which], distances)
             for k, half, distance in zip(parts, middle.tolist(), distances.tolist(), strict=True):
                 if distance < -contact[k]:
                     del stacks[k]
@@ -492,26 +532,20 @@ class _Sweep:
         return np.searchsorted(self._waypoints, rows, side="right") - 1
 
     def _make_hits(
-        self, rows: Ints, pairs: Ints, distances: Floats, *, at_waypoint: bool = False
-    ) -> Iterator[Hit]:
+        self, rows: Ints, pairs: Ints, distances: Floats, *, at_waypoints: bool = False
+    ) -> Hits:
         at = self._find_interval(rows)
-        labels = self._solids.world.collision_labels
-        margins = self._table.get_margins(pairs, at)
-        contacts = self._table.get_contact_overlaps(pairs, at, at if at_waypoint else at + 1)
         is_exempt = self._table.find_exempt(pairs, at)
-        exempt_clearances = np.where(is_exempt, self._table.margins[pairs], 0.0)
-        for n, (i, j) in enumerate(self._table.pairs[pairs].tolist()):
-            yield Hit(
-                row=int(rows[n]),
-                first=labels[i],
-                second=labels[j],
-                distance=float(distances[n]),
-                margin=float(margins[n]),
-                contact=float(contacts[n]),
-                at_waypoint=at_waypoint,
-                exempt_clearance=float(exempt_clearances[n]),
-                shapes=(i, j),
-            )
+        return Hits(
+            table=self._table,
+            rows=rows,
+            pairs=pairs,
+            distances=distances,
+            margins=self._table.get_margins(pairs, at),
+            contacts=self._table.get_contact_overlaps(pairs, at, at if at_waypoints else at + 1),
+            exempt_clearances=np.where(is_exempt, self._table.margins[pairs], 0.0),
+            at_waypoints=at_waypoints,
+        )
 
 
 class Intervals(NamedTuple):

@@ -16,7 +16,7 @@ import pinocchio as pin
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.collision.boxes import WorldBoxes
 from vkc_pin.world.collision.distances import Shapes
-from vkc_pin.world.collision.solids import ShapePlacements, flatten_placements
+from vkc_pin.world.collision.solids import BatchedModel, flatten_placements
 from vkc_pin.world.models.coordinates import MovedJoint
 from vkc_pin.world.models.shapes import compute_bounding_box, compute_shape_distance
 from vkc_pin.world.scene.scene import Scene
@@ -37,7 +37,7 @@ class CollisionShapes:
         self.body_count = len(world.bodies.geometryObjects)
         bodies = world.shapes[: self.body_count]
         self._body_boxes = [compute_bounding_box(shape) for shape in bodies]
-        self._placements = ShapePlacements(world.model, world.bodies)
+        self._placements = BatchedModel.of_shapes(world.model, world.bodies)
         self._set_obstacles(world)
 
     def with_obstacles(self, scene: Scene) -> CollisionShapes:

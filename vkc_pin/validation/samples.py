@@ -12,6 +12,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import check_choice
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.validation.report import Violation
+from vkc_pin.world.collision.solids import BatchedModel
 from vkc_pin.world.models.articulated_object import Attachment, Freedom
 from vkc_pin.world.models.gripper import WIDTH_TOLERANCE
 from vkc_pin.world.scene.contact_rules import compute_hand_frame
@@ -61,6 +62,7 @@ class Samples:
         self.scene = scene
         self.trajectory = trajectory
         self.world = World(scene)
+        self._frames: dict[tuple[str, ...], BatchedModel] = {}  # by their names
         self.grasp_freedoms: dict[str, Freedom] = {}
         for owner, placed in scene.objects.items():
             for attachment in placed.object.attachments.values():
@@ -342,17 +344,10 @@ class Samples:
     def _compute_frames(self, z: Floats, *names: str) -> tuple[Floats, Floats]:
         """Compute rotations, shape (K, F, 3, 3), and origins, shape (K, F, 3) [m], of F frames."""
         model = self.world.model
-        data = model.createData()
-        frames = [model.getFrameId(name) for name in names]
-        rotations = np.empty((len(z), len(frames), 3, 3))
-        origins = np.empty((len(z), len(frames), 3))
-        for k, q in enumerate(self.world.coordinates.q(z)):
-            pin.forwardKinematics(model, data, q)
-            for f, frame in enumerate(frames):
-                placement = pin.updateFramePlacement(model, data, frame)
-                rotations[k, f] = placement.rotation
-                origins[k, f] = placement.translation
-        return rotations, origins
+        if names not in self._frames:
+            numbers = [model.getFrameId(name) for name in names]
+            self._frames[names] = BatchedModel.of_frames(model, numbers)
+        return self._frames[names].compute_poses(self.world.coordinates.q(z))
 
     def compute_grasp_errors(self, hold: Hold, rows: Ints) -> Floats:
         """Compute position [m] and angle [rad] errors of a grasp at samples, shape (K, 2)."""

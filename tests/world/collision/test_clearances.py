@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from vkc_pin.world.collision import distances as distances_module
 from vkc_pin.world.collision.boxes import Boxes
 from vkc_pin.world.collision.distances import Clearances, MarginRegion, Margins, Shapes
-from vkc_pin.world.collision.solids import ShapePlacements
+from vkc_pin.world.collision.solids import BatchedModel
 from vkc_pin.world.models.shapes import compute_shape_distance
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -65,7 +65,9 @@ class Room:
         centers = np.array([placement.translation for placement in placed])
         boxes = Boxes(joints, rotations, centers, self.halves, self.pairs)
         shapes = Shapes(self.solids, self.fixed, threads=4)
-        return Clearances(ShapePlacements(self.model, self.geometry), boxes, shapes, self.margins)
+        return Clearances(
+            BatchedModel.of_shapes(self.model, self.geometry), boxes, shapes, self.margins
+        )
 
     def compute_distances(self) -> np.ndarray:
         """Return the distances of all pairs at all states, shape (STATES, P) [m]."""
@@ -106,7 +108,7 @@ def test_closest_shapes_match_an_exhaustive_search(
     bounds = distances - margins - slack
     order, count = np.argsort(bounds, axis=1), len(margins)
     chosen, found = Shapes(room.solids, room.fixed, threads=3).find_closest_pairs(
-        ShapePlacements(room.model, room.geometry).compute_placements(room.q),
+        BatchedModel.of_shapes(room.model, room.geometry).compute_placements(room.q),
         count * np.arange(STATES + 1),
         room.pairs[order.ravel()],
         ranks=order.ravel(),

@@ -22,7 +22,7 @@ from vkc_pin.planning.chain.collision_pairs import PhaseGeometry, build_phase_ge
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.utils.budget import record_evaluations
 from vkc_pin.world.collision.distances import Clearances, Shapes
-from vkc_pin.world.collision.solids import ShapePlacements
+from vkc_pin.world.collision.solids import BatchedModel
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene
@@ -113,11 +113,11 @@ class ContactModel:
         self.task = task
         segments = [phase.segments for phase in task.phases]
         self.first_waypoint = np.concatenate([[0], np.cumsum(segments)])
-        placements_by_opening = dict[float | None, ShapePlacements]()
+        placements_by_opening = dict[float | None, BatchedModel]()
         for phase in task.phases:
             if phase.opening not in placements_by_opening:
                 geometry = chain.get_collision_geometry(phase.opening)
-                placements_by_opening[phase.opening] = ShapePlacements(chain.model, geometry)
+                placements_by_opening[phase.opening] = BatchedModel.of_shapes(chain.model, geometry)
         self.phases = build_phase_geometries(scene, chain, task, options)
         self._clearances = [
             self._make_clearances(part, placements_by_opening[phase.opening])
@@ -129,7 +129,7 @@ class ContactModel:
         self._joints = np.zeros(geometry_count, int)
         self._joints[: len(joints_of_chain)] = joints_of_chain
 
-    def _make_clearances(self, part: PhaseGeometry, placements: ShapePlacements) -> Clearances:
+    def _make_clearances(self, part: PhaseGeometry, placements: BatchedModel) -> Clearances:
         moving = len(self.chain.collision.geometryObjects)
         geometries = [shape.geometry for shape in part.shapes]
         static_placements = [shape.placement for shape in part.shapes[moving:]]

@@ -10,7 +10,10 @@
 #include <vector>
 
 #undef PINOCCHIO_WITH_COLLISION // it would require octomap
+#include <pinocchio/algorithm/frames.hpp>
+#include <pinocchio/algorithm/jacobian.hpp>
 #include <pinocchio/algorithm/kinematics.hpp>
+#include <pinocchio/algorithm/rnea.hpp>
 #include <pinocchio/config.hpp>
 #include <pinocchio/multibody.hpp>
 #include <pinocchio/serialization.hpp>
@@ -33,7 +36,7 @@ struct Bodies::Kinematics::Work
   explicit Work(const Shared & shared);
 
   pinocchio::Data data;
-  Eigen::VectorXd q;
+  Eigen::VectorXd q, v, a;
   std::vector<double> shapes, rotations, translations;
 };
 
@@ -80,6 +83,8 @@ std::size_t Bodies::joints() const { return std::size_t(shared_->model.njoints);
 
 std::size_t Bodies::coordinates() const { return std::size_t(shared_->model.nq); }
 
+std::size_t Bodies::velocities() const { return std::size_t(shared_->model.nv); }
+
 Bodies::Kinematics::Kinematics(const Bodies & bodies) : bodies_(bodies)
 {
   Shared & shared = *bodies.shared_;
@@ -122,6 +127,36 @@ void Bodies::Kinematics::compute(const double * configuration)
     Eigen::Map<Eigen::Matrix3d>{numbers} = placed.rotation();
     Eigen::Map<Eigen::Vector3d>{numbers + 9} = placed.translation();
   }
+}
+
+void Bodies::Kinematics::compute_jacobians(const double * configuration, double * jacobians)
+{
+  using RowMajor = Eigen::Matrix<double, 6, Eigen::Dynamic, Eigen::RowMajor>;
+  const Shared & shared = *bodies_.shared_;
+  Work & work = *work_;
+  std::copy_n(configuration, work.q.size(), work.q.data());
+  pinocchio::computeJointJacobians(shared.model, work.data, work.q);
+  pinocchio::Data::Matrix6x jacobian(6, shared.model.nv);
+  for (std::size_t k = 0; k < shared.joints.size(); ++k)
+  {
+    jacobian.setZero();
+    if (shared.joints[k])
+      pinocchio::getFrameJacobian(
+        shared.model, work.data, shared.joints[k], shared.placements[k], pinocchio::LOCAL_WORLD_ALIGNED, jacobian);
+    Eigen::Map<RowMajor>(jacobians + k * std::size_t(jacobian.size()), 6, shared.model.nv) = jacobian;
+  }
+}
+
+void Bodies::Kinematics::compute_inverse_dynamics(
+  const double * configuration, const double * velocity, const double * acceleration, double * torques)
+{
+  using Vector = Eigen::Map<const Eigen::VectorXd>;
+  const Shared & shared = *bodies_.shared_;
+  Work & work = *work_;
+  std::copy_n(configuration, work.q.size(), work.q.data());
+  work.v = Vector(velocity, shared.model.nv);
+  work.a = Vector(acceleration, shared.model.nv);
+  Eigen::Map<Eigen::VectorXd>(torques, shared.model.nv) = pinocchio::rnea(shared.model, work.data, work.q, work.v, work.a);
 }
 
 const double * Bodies::Kinematics::shapes() const { return work_->shapes.data(); }

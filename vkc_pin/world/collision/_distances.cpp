@@ -51,7 +51,9 @@ NB_MODULE(_distances, module)
           throw std::invalid_argument("placements are of shape (n, 12)");
         new (self) Bodies(std::string(model.c_str(), model.size()), joints.shape(0), joints.data(), placements.data());
       })
-    .def("placements", &compute_placements);
+    .def("placements", &compute_placements)
+    .def("jacobians", &compute_jacobians)
+    .def("inverse_dynamics", &compute_inverse_dynamics);
   nb::class_<Margins>(module, "Margins")
     .def(nb::init<const Numbers<1> &>())
     .def("ease", &Margins::relax)

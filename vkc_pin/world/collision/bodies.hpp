@@ -1,4 +1,4 @@
-// Placements of the shapes on the joints of a Pinocchio model.
+// Placements of shapes or frames on the joints of a Pinocchio model, their Jacobians, and inverse dynamics.
 //
 // Models are passed in serialized form, so that this module shares no C++ objects with Pinocchio's
 // Python bindings; the kinematics are computed by the same libpinocchio. Only the translation unit
@@ -25,6 +25,7 @@ public:
   std::size_t shapes() const;
   std::size_t joints() const; // including joint 0, the world
   std::size_t coordinates() const;
+  std::size_t velocities() const;
 
   // Evaluates the kinematics; not thread-safe.
   class Kinematics
@@ -35,9 +36,16 @@ public:
 
     void compute(const double * configuration);
 
+    // Writes the Jacobians of the shapes at their origins in the axes of the world, 6 x velocities numbers each, row-major.
+    void compute_jacobians(const double * configuration, double * jacobians);
+
     const double * shapes() const;       // placements of the shapes, 12 numbers each
     const double * rotations() const;    // of the joints, 9 numbers each, row-major
     const double * translations() const; // of the joints, 3 numbers each
+
+    // Writes the torques at velocities and accelerations.
+    void compute_inverse_dynamics(
+      const double * configuration, const double * velocity, const double * acceleration, double * torques);
 
   private:
     struct Work;

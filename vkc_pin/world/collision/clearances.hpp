@@ -147,6 +147,41 @@ Array<double> compute_placements(const Bodies & bodies, const Numbers<2> & q)
   return handed_over(std::move(found), {states, shapes, PLACEMENT});
 }
 
+Array<double> compute_jacobians(const Bodies & bodies, const Numbers<2> & q)
+{
+  if (q.shape(1) != bodies.coordinates())
+    throw std::invalid_argument("configurations are of shape (W, nq)");
+  const std::size_t states = q.shape(0), shapes = bodies.shapes(), size = 6 * bodies.velocities() * shapes;
+  std::vector<double> found(states * size);
+  {
+    nb::gil_scoped_release released;
+    Bodies::Kinematics kinematics(bodies);
+    for (std::size_t s = 0; s < states; ++s)
+      kinematics.compute_jacobians(q.data() + s * q.shape(1), found.data() + s * size);
+  }
+  return handed_over(std::move(found), {states, shapes, 6, bodies.velocities()});
+}
+
+Array<double> compute_inverse_dynamics(
+  const Bodies & bodies, const Numbers<2> & q, const Numbers<2> & v, const Numbers<2> & a)
+{
+  const std::size_t states = q.shape(0), velocities = bodies.velocities();
+  if (q.shape(1) != bodies.coordinates())
+    throw std::invalid_argument("configurations are of shape (W, nq)");
+  for (const auto * rates : {&v, &a})
+    if (rates->shape(0) != states || rates->shape(1) != velocities)
+      throw std::invalid_argument("velocities and accelerations are of shape (W, nv)");
+  std::vector<double> found(states * velocities);
+  {
+    nb::gil_scoped_release released;
+    Bodies::Kinematics kinematics(bodies);
+    for (std::size_t s = 0; s < states; ++s)
+      kinematics.compute_inverse_dynamics(
+        q.data() + s * q.shape(1), v.data() + s * velocities, a.data() + s * velocities, found.data() + s * velocities);
+  }
+  return handed_over(std::move(found), {states, velocities});
+}
+
 // State, pair, distance, margin, normal and witness points of the pairs with least distance −
 // margin; see distances.py.
 std::tuple<Array<Index>, Array<Index>, Array<double>, Array<double>, Array<double>, Array<double>, Array<double>> find_closest_pairs(

@@ -16,7 +16,7 @@ import pinocchio as pin
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.collision.boxes import Boxes
 from vkc_pin.world.collision.solids import (
-    ShapePlacements,
+    BatchedModel,
     convert_solid,
     count_threads,
     flatten_placements,
@@ -261,7 +261,7 @@ class Clearances:
     """
 
     def __init__(
-        self, placements: ShapePlacements, boxes: Boxes, shapes: Shapes, margins: Margins
+        self, placements: BatchedModel, boxes: Boxes, shapes: Shapes, margins: Margins
     ) -> None:
         self.placements = placements
         self.boxes = boxes

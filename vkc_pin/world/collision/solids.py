@@ -6,14 +6,14 @@ import os
 import weakref
 from collections.abc import Sequence
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import coal
 import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import BuildError, InputError
-from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.utils.optional_imports import REBUILD_HINT, import_compiled
 from vkc_pin.utils.system import count_cores
 from vkc_pin.world.files.meshes import get_triangles
@@ -135,25 +135,37 @@ def flatten_placements(placements: Sequence[pin.SE3]) -> Floats:
     return rows
 
 
-class ShapePlacements:
-    """Forward kinematics of the shapes of a model, equal to Pinocchio's bit for bit.
+class BatchedModel:
+    """A model with M frames at W configurations at once; results are Pinocchio's, bit by bit.
 
     Args:
-        model: The model.
-        geometry: The M shapes on its joints.
+        model: The model, with nq coordinates and nv velocities.
+        joints: Joint of each frame, shape (M,).
+        placements: Placements of the frames on their joints, see `flatten_placements`, (M, 12).
     """
 
-    def __init__(self, model: pin.Model, geometry: pin.GeometryModel) -> None:
+    def __init__(self, model: pin.Model, joints: Ints, placements: Floats) -> None:
         serialized = pin.serialization.StreamBuffer()
         model.saveToBinary(serialized)
         content = bytes(serialized.view())  # tobytes() would leak a view at every call
-        shapes = geometry.geometryObjects
-        joints = np.array([shape.parentJoint for shape in shapes], np.int64)
-        placements = flatten_placements([shape.placement for shape in shapes])
         self.compiled: Any = load_compiled().Bodies(content, joints, placements)
 
+    @classmethod
+    def of_shapes(cls, model: pin.Model, geometry: pin.GeometryModel) -> Self:
+        """Return a model with its shapes as frames."""
+        shapes = geometry.geometryObjects
+        joints = np.array([shape.parentJoint for shape in shapes], np.int64)
+        return cls(model, joints, flatten_placements([shape.placement for shape in shapes]))
+
+    @classmethod
+    def of_frames(cls, model: pin.Model, numbers: Sequence[int]) -> Self:
+        """Return a model with some of its frames."""
+        frames = [model.frames[number] for number in numbers]
+        joints = np.array([frame.parentJoint for frame in frames], np.int64)
+        return cls(model, joints, flatten_placements([frame.placement for frame in frames]))
+
     def compute_placements(self, q: Floats) -> Floats:
-        """Return the placements of the shapes in the world frame, shape (W, M, 12).
+        """Return the placements of the frames in the world, shape (W, M, 12).
 
         Args:
             q: Pinocchio configurations, shape (W, nq).
@@ -162,3 +174,24 @@ class ShapePlacements:
             Placements in the format of `flatten_placements`.
         """
         return np.asarray(self.compiled.placements(q), float)
+
+    def compute_poses(self, q: Floats) -> tuple[Floats, Floats]:
+        """Return rotations, shape (W, M, 3, 3), and origins, shape (W, M, 3) [m], in the world."""
+        placements = self.compute_placements(q)
+        columns = placements[..., :_FIRST_TRANSLATION]
+        rotations = columns.reshape(*columns.shape[:-1], 3, 3).swapaxes(-1, -2)
+        return rotations, placements[..., _FIRST_TRANSLATION:]
+
+    def compute_jacobians(self, q: Floats) -> Floats:
+        """Return the Jacobians at the frames' origins in the axes of the world, (W, M, 6, nv)."""
+        return np.asarray(self.compiled.jacobians(q), float)
+
+    def compute_inverse_dynamics(self, q: Floats, v: Floats, a: Floats) -> Floats:
+        """Return the joint torques by recursive Newton-Euler, shape (W, nv) [N·m], [N].
+
+        Args:
+            q: Pinocchio configurations, shape (W, nq).
+            v: Velocities, shape (W, nv).
+            a: Accelerations, shape (W, nv).
+        """
+        return np.asarray(self.compiled.inverse_dynamics(q, v, a), float)

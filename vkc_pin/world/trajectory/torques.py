@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.world.collision.solids import BatchedModel
 from vkc_pin.world.models.dynamics import TorqueLimits, compute_inertia
 from vkc_pin.world.scene.contact_rules import compute_hand_frame
 from vkc_pin.world.scene.hold import Hold, get_attachment
@@ -50,7 +51,9 @@ class Handle:
         # Springs carry the object itself, not its loads: they have a model with gravity.
         own = pin.Model(item.model)
         own.gravity.linear = np.zeros(3)
-        self._models = [own]
+        frame = item.link_frame(self.attachment.link)
+        self._own = BatchedModel.of_frames(own, [frame])
+        self._loaded: BatchedModel | None = None
         if loads:
             loaded = pin.Model(item.model)
             loaded.gravity.linear = self.placed.placement.rotation.T @ item.model.gravity.linear
@@ -58,9 +61,8 @@ class Handle:
                 loaded.inertias[joint] = pin.Inertia.Zero()
             for joint, inertia in loads:
                 loaded.inertias[joint] += inertia
-            self._models.append(loaded)
-        self._frame = item.link_frame(self.attachment.link)
-        path = list(own.supports[own.frames[self._frame].parentJoint])
+            self._loaded = BatchedModel.of_frames(loaded, [])
+        path = list(own.supports[own.frames[frame].parentJoint])
         self._moved = [k for k, joint in enumerate(item.coordinates.joints) if joint in path]
 
     def wrenches(self, motion: Motion) -> Floats:
@@ -77,9 +79,9 @@ class Handle:
         freedoms = [np.zeros((len(z), 0))]
         for name in self.attachment.coordinates:
             freedoms.append(motion.positions[f"{self.name}.{name}"])
-        jacobians, rotations, origins = _compute_jacobians(
-            self._models[0], self._frame, item.coordinates.q(z)
-        )
+        q = item.coordinates.q(z)
+        jacobians = self._own.compute_jacobians(q)[:, 0]
+        rotations, origins = (poses[:, 0] for poses in self._own.compute_poses(q))
         points, free = self._place_hand(rotations, origins, np.column_stack(freedoms))
         # Twists of the link's frame, shape (K, joints, 6); v + ω × (p − o) at the hand.
         twists = np.swapaxes(jacobians[:, :, self._moved], 1, 2)
@@ -142,12 +144,10 @@ class Handle:
         z = self._collect_columns(motion.positions, self.placed.state)
         v = self._collect_columns(motion.velocities, rest)
         a = self._collect_columns(motion.accelerations, rest)
-        found = np.zeros(z.shape)
-        configurations = item.coordinates.q(z)
-        for model in self._models:
-            data = model.createData()
-            for k, q in enumerate(configurations):
-                found[k] += pin.rnea(model, data, q, v[k], a[k])
+        q = item.coordinates.q(z)
+        found = self._own.compute_inverse_dynamics(q, v, a)
+        if self._loaded is not None:
+            found += self._loaded.compute_inverse_dynamics(q, v, a)
         held = {latch.joint: latch.held_at for latch in item.latches}
         for k, name in enumerate(item.coordinates.names):
             is_still = np.abs(v[:, k]) <= _STILL
@@ -217,9 +217,12 @@ def sample_curve(curve: Curve) -> MotionSamples:
 
 @dataclass(frozen=True, eq=False)
 class _Load:
-    """The robot model of a phase with its carried objects, and the handles that the arm moves."""
+    """The robot of a phase with its carried objects, and the handles that the arm moves.
 
-    model: pin.Model
+    The only frame of the robot is its tool.
+    """
+
+    robot: BatchedModel
     handles: tuple[Handle, ...]
 
 
@@ -303,22 +306,19 @@ class Torques:
         v, a = transform_to_base_axes(
             positions[:, 2], velocities[:, :size], accelerations[:, :size]
         )
-        data = load.model.createData()
-        found = np.empty((len(positions), size))
-        configurations = robot.coordinates.q(positions[:, :size])
-        for k, q in enumerate(configurations):
-            found[k] = pin.rnea(load.model, data, q, v[k], a[k])
+        q = robot.coordinates.q(positions[:, :size])
+        found = load.robot.compute_inverse_dynamics(q, v, a)
         motion = Motion(
             positions=dict(zip(names, positions.T, strict=True)),
             velocities=dict(zip(names, velocities.T, strict=True)),
             accelerations=dict(zip(names, accelerations.T, strict=True)),
         )
-        frame = load.model.getFrameId(robot.tool_frame)
         for handle in load.handles:
-            jacobians, rotations, _ = _compute_jacobians(load.model, frame, configurations)
+            jacobians = load.robot.compute_jacobians(q)[:, 0]
+            rotations, _ = load.robot.compute_poses(q)
             wrenches = handle.wrenches(motion)
             # A force f at the point r of the hand has the moment r × f about the tool's origin.
-            arms = rotations @ handle.point.translation
+            arms = rotations[:, 0] @ handle.point.translation
             wrenches[:, 3:] += np.cross(arms, wrenches[:, :3])
             # τ = Jᵀ w
             found += np.einsum("kij,ki->kj", jacobians, wrenches)
@@ -340,7 +340,8 @@ class Torques:
         for hold in fixed:
             if objects[hold.object].object.coordinates.size:
                 handles.append(Handle(self.scene, hold, loads[hold.object]))
-        self._loads[number] = _Load(model, tuple(handles))
+        tool = model.getFrameId(self.scene.robot.tool_frame)
+        self._loads[number] = _Load(BatchedModel.of_frames(model, [tool]), tuple(handles))
         return self._loads[number]
 
     def _add_inertias(
@@ -395,30 +396,6 @@ def _express_in_joint(
     joint = item.model.frames[item.link_frame(link)].parentJoint
     in_object = placed.placement.actInv(inertia)
     return joint, data.oMi[joint].actInv(in_object)
-
-
-def _compute_jacobians(
-    model: pin.Model, frame: int, configurations: Floats
-) -> tuple[Floats, Floats, Floats]:
-    """Compute Jacobians of a frame at its origin, in the model's root axes, shape (K, 6, nv).
-
-    Also returns the frame's rotations, shape (K, 3, 3), and origins, shape (K, 3) [m].
-    """
-    data = model.createData()
-    count = len(configurations)
-    jacobians = np.empty((count, 6, model.nv))
-    rotations = np.empty((count, 3, 3))
-    origins = np.empty((count, 3))
-    placement = data.oMf[frame]
-    # Both are views, which every evaluation updates.
-    rotation = placement.rotation
-    origin = placement.translation
-    for k, q in enumerate(configurations):
-        jacobian = pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED)
-        jacobians[k] = jacobian.reshape(6, -1)
-        rotations[k] = rotation
-        origins[k] = origin
-    return jacobians, rotations, origins
 
 
 def transform_to_base_axes(

@@ -381,11 +381,23 @@ class _Sweep:
         segments, pairs = self._find_active_pairs(
             placed, np.diff(moved[waypoints], axis=0), smallest
         )
-        both_ends = np.concatenate([segments, segments + 1])
-        both_pairs = np.tile(self._table.pairs[pairs], (2, 1))
-        before, after = np.split(placed.compute_distances(both_ends, both_pairs), 2)
+        before, after = self._measure_both_ends(placed, segments, pairs)
         intervals = Intervals(waypoints[segments], waypoints[segments + 1], pairs, before, after)
         yield from self._search_intervals(z, intervals, moved, smallest)
+
+    def _measure_both_ends(
+        self, placed: PlacedShapes, segments: Ints, pairs: Ints
+    ) -> tuple[Floats, Floats]:
+        """Return the distances of pairs at both ends of segments, shape (n,) each [m]."""
+        # A segment ends where the next one begins.
+        states = np.append(segments, segments + 1)
+        numbers, which = np.unique(
+            states * len(self._table.pairs) + np.tile(pairs, 2), return_inverse=True
+        )
+        states, pairs = np.divmod(numbers, len(self._table.pairs))
+        distances = placed.compute_distances(states, self._table.pairs[pairs])
+        before, after = np.split(distances[which], 2)
+        return before, after
 
     def _place(self, z: Floats) -> PlacedShapes:
         """Place the shapes at configurations of the world, shape (W, n)."""

@@ -200,10 +200,12 @@ def find_reduced_margins(
     at_end = (last - steps, last)
     for holds, window in ((phase.released, at_begin), (phase.grasps, at_end)):
         for hold in holds:
+            margins: dict[str, float] = {}
             for k in _find_pairs_with_hand(scene, hold, part):
                 link = part.labels[part.pairs[k, 1]]
-                margin = _compute_hand_margin(scene, hold, link, options)
-                reduced.setdefault(k, []).append((*window, margin))
+                if link not in margins:
+                    margins[link] = _compute_hand_margin(scene, hold, link, options)
+                reduced.setdefault(k, []).append((*window, margins[link]))
     reach = float(part.margins.max())
     supports = _find_supports(scene, chain, task, number, part)
     touches = _find_touches(chain, task, number, part)
@@ -370,6 +372,10 @@ class _PairBuilder:
                 for i in indices:
                     link = get_link_name(get_local_name(geometries[i].name))
                     self._labels.append(f"{hold_or_supported.object}.{link}")
+        own_margins = scene.robot.own_margins(options.self_distance)
+        self._own_pairs = [(i, j, margin) for (i, j), margin in own_margins.items()]
+        # of a hold and the labels of two shapes [m]
+        self._attached_margins: dict[tuple[Hold, str, str], float] = {}
         self._exemptions = find_clearance_exemptions(scene, options.dist_safe)
         self._obstacles = scene.obstacles
         self._boxes_of_chain = _compute_boxes([*geometries])
@@ -386,17 +392,14 @@ class _PairBuilder:
         chain = self.chain
         labels = self._labels
         margin = self.options.dist_safe
-        pairs = list[tuple[int, int, float]]()
-        own_margins = self.scene.robot.own_margins(self.options.self_distance)
-        for (i, j), own_margin in own_margins.items():
-            pairs.append((i, j, own_margin))
+        pairs = list(self._own_pairs)
         attached_shapes: dict[str, tuple[int, ...]] = {}
         moving = list(self._robot_geometries)
         for hold in phase.held:
             grasped = chain.held_geometries[hold]
             attached_shapes[hold.object] = grasped
             for i, j in itertools.product(moving, grasped):
-                pairs.append((i, j, self._find_attached_margin(hold, labels[i], labels[j])))
+                pairs.append((i, j, self._get_attached_margin(hold, labels[i], labels[j])))
             for i, j in itertools.combinations(grasped, 2):
                 if self._can_self_collide(hold.object, labels[i], labels[j]):
                     pairs.append((i, j, margin))
@@ -444,7 +447,7 @@ class _PairBuilder:
                         continue
                     margin = self.options.dist_safe
                     if name in holds:  # the hand moves only some of its joints
-                        margin = self._find_attached_margin(holds[name], labels[i], label)
+                        margin = self._get_attached_margin(holds[name], labels[i], label)
                     pairs.append((i, index, margin))
                 shape.name = f"{name}.{shape.name}"
                 static_shapes.append(shape)
@@ -515,6 +518,12 @@ class _PairBuilder:
             if self.scene.objects[name].object.free:
                 movers.update(indices)
         return [i for i in moving if i in movers]
+
+    def _get_attached_margin(self, hold: Hold, one: str, link: str) -> float:
+        key = (hold, one, link)
+        if key not in self._attached_margins:
+            self._attached_margins[key] = self._find_attached_margin(hold, one, link)
+        return self._attached_margins[key]
 
     def _find_attached_margin(self, hold: Hold, one: str, link: str) -> float:
         """Return the clearance [m] between label `one` and label `link` of a grasped object.

@@ -39,6 +39,7 @@ def check_motion(world: World) -> Iterator[Violation]:
             "limit", name, outside - 1e-5, np.zeros(len(outside)), f"limits {low:.4g} to {high:.4g}"
         )
         begin = world.start_velocity.get(name, 0.0)
+        end = _get_end_velocity(world, name)
         # objects in the hand move with it, which the rules of grasps judge
         owners = {hold.object for hold in world.held} if any(world.start_velocity.values()) else ()
         is_in_hand = name.partition(".")[0] in owners
@@ -46,7 +47,7 @@ def check_motion(world: World) -> Iterator[Violation]:
             spans = np.diff(plan.times)
             velocity = np.diff(column) / spans
             before = velocity[0] if is_in_hand else begin
-            change = np.abs(np.diff(np.concatenate([[before], velocity, [0.0]])))
+            change = np.abs(np.diff(np.concatenate([[before], velocity, [end]])))
             shorter = np.minimum(np.append(spans, np.inf), np.append(np.inf, spans))
             acceleration = change / shorter
             acceleration_times = plan.times
@@ -65,9 +66,9 @@ def check_motion(world: World) -> Iterator[Violation]:
             yield from _find_worst(
                 "velocity",
                 name,
-                np.array([abs(first - before), abs(last)]) - 1e-6,
+                np.array([abs(first - before), abs(last - end)]) - 1e-6,
                 plan.times[[0, -1]],
-                f"begins with {before:g} and ends at rest",
+                f"begins with {before:g} and ends with {end:g}",
             )
         yield from _find_worst(
             "velocity",
@@ -188,6 +189,15 @@ def _check_dwell(world: World) -> Iterator[Violation]:
                 shortfall,
                 f"rests for {rest:.3f} s while the hand moves",
             )
+
+
+def _get_end_velocity(world: World, name: str) -> float:
+    """Return the velocity with which the last step asks a coordinate to end; 0: at rest."""
+    for joint, value in world.plan.steps[-1].get("velocities", {}).items():
+        leader, factor, _ = world.robot.coupled.get(joint, (joint, 1.0, 0.0))
+        if leader == name:
+            return float(value / factor)
+    return 0.0
 
 
 def check_stage(world: World, stage: Stage) -> Iterator[Violation]:

@@ -71,7 +71,11 @@ def test_longest_interval_is_reported() -> None:
 
 
 def find_violations(motion: Trajectory, **options: float) -> dict[tuple[str, str], Violation]:
-    rows = check_rates(Samples(plan_drawer().scene, motion), vkc.Options(**options))  # type: ignore[arg-type]
+    rows = check_rates(
+        Samples(plan_drawer().scene, motion),
+        plan_drawer().steps,
+        vkc.Options(**options),  # type: ignore[arg-type]
+    )
     return {(row.constraint, row.unit): row for row in rows if row.subject == "elbow_joint"}
 
 

@@ -67,10 +67,13 @@ def execute(
         planner: Planner whose caches are used.
 
     Raises:
-        InputError: The plan is no success, the robot is not at its start, or an argument is
-            invalid.
+        InputError: The plan is no success or ends in motion, the robot is not at its start, or an
+            argument is invalid.
     """
     check_instance(plan, Plan, "plan").check_success()
+    if plan.ends_in_motion:
+        problem, expected = "it ends in motion, and nothing follows", "a plan that ends at rest"
+        raise InputError(problem, field="plan", expected=expected)
     if not isinstance(robot, Robot):
         expected = "an object with the methods of `Robot`"
         raise InputError("no robot", field="robot", expected=expected, got=format_value(robot))

@@ -21,7 +21,7 @@ from vkc_pin.world.files.resources import check_path
 from vkc_pin.world.files.writing import write_atomically
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actions import compile_each_step
-from vkc_pin.world.task.steps import Step, step_from_dict, step_to_dict
+from vkc_pin.world.task.steps import Configure, Step, step_from_dict, step_to_dict
 from vkc_pin.world.task.terms import Term, term_from_dict, term_to_dict
 from vkc_pin.world.trajectory.formats.archives import (
     read_archive,
@@ -197,12 +197,23 @@ class Plan:
     def end_scene(self) -> Scene:
         """Return the scene at the end of the trajectory, from which planning can continue.
 
+        Its start has the velocity with which the last step ends.
+
         Raises:
             InputError: The plan is no success.
         """
         self.check_success("end_scene")
         after = compile_each_step(self.scene, self.steps, self.options)[-1].after
-        return compute_final_scene(self.scene, self.trajectory, after)
+        scene = compute_final_scene(self.scene, self.trajectory, after)
+        motion = self.trajectory
+        velocity = motion.velocity(motion.times[-1])[: motion.robot_size]
+        return scene.with_start(velocity=velocity) if self.ends_in_motion else scene
+
+    @property
+    def ends_in_motion(self) -> bool:
+        """Whether the last step ends with a velocity; see `Configure`."""
+        last = self.steps[-1]
+        return isinstance(last, Configure) and any(last.velocities.values())
 
     def scene_at(self, time: float) -> Scene:
         """Return the scene at a time of the motion [s], in which robot and objects are underway.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -14,6 +14,7 @@ from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.validation.report import Bound, Violation
 from vkc_pin.validation.samples import Samples
 from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.task.steps import Configure, Step
 from vkc_pin.world.trajectory.curve import sample_intervals
 from vkc_pin.world.trajectory.torques import MotionSamples, Torques, sample_curve
 from vkc_pin.world.trajectory.trajectory import Trajectory
@@ -109,10 +110,11 @@ def _find_longest_stretch(times: Floats, labels: Ints, label: int) -> tuple[floa
     return stretch
 
 
-def check_rates(samples: Samples, options: Options) -> Iterator[Violation]:
+def check_rates(samples: Samples, steps: Sequence[Step], options: Options) -> Iterator[Violation]:
     """Yield the worst violations of velocity and acceleration limits (eq. 5) and of jerk limits.
 
-    A curve must begin with the velocity of the scene's start and end at rest. Accelerations are
+    A curve must begin with the velocity of the scene's start and end with that of the last step, at
+    rest if it states none. Accelerations are
     evaluated at the ends of its cubics, where they are largest. The jerk of each cubic is constant;
     with jerk limits, accelerations must not jump between cubics. Jerks of a motion without a curve
     are not checked, as its velocities jump.
@@ -128,7 +130,10 @@ def check_rates(samples: Samples, options: Options) -> Iterator[Violation]:
         accelerations = motion.accelerations(samples.estimate_start_velocity())
     else:
         moments = curve.times
-        end_errors = curve.rates[[0, -1]] - [samples.start_velocity, np.zeros(len(motion.names))]
+        end_errors = curve.rates[[0, -1]] - [
+            samples.start_velocity,
+            _find_end_velocity(samples, steps[-1]),
+        ]
         end_errors = np.nan_to_num(np.abs(end_errors))
         velocities, accelerations = curve.compute_max_rates()
         if options.jerk_time > 0.0:
@@ -148,6 +153,16 @@ def check_rates(samples: Samples, options: Options) -> Iterator[Violation]:
             checks.append(_RateCheck("jerk", jumps[:, i], max_jump, "s² at once", moments))
         for check in checks:
             yield from _check_rate(samples, name, check)
+
+
+def _find_end_velocity(samples: Samples, step: Step) -> Floats:
+    """Return the velocity of the trajectory's coordinates with which a last step ends, (n,)."""
+    velocity = np.zeros(len(samples.trajectory.names))
+    if isinstance(step, Configure):
+        for joint, value in step.velocities.items():
+            move = samples.scene.robot.planned_joints[joint]
+            velocity[move.coordinate] = value / move.factor
+    return velocity
 
 
 class _RateCheck(NamedTuple):

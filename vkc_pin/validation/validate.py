@@ -87,7 +87,7 @@ def validate(
         *_check_undriven_joints(samples),
         *_check_tilt(samples),
         *_check_latches(samples),
-        *check_rates(samples, options),
+        *check_rates(samples, asked, options),
         *check_rolling(samples),
         *check_goals(samples, asked, tolerances),
         *check_terms(samples, traced),

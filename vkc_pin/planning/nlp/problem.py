@@ -199,12 +199,14 @@ class TrajectoryProblem:
         return start
 
     def _make_end_velocities(self) -> Floats:
-        """Return the velocities at the start, as the scene states it, and at the end: at rest.
+        """Return the velocities at the start, as the scene states it, and at the end, as the task.
 
         A grasped object that is fixed in the world moves with the hand: with the Jacobians J_r and
         J_o of the closures' residuals, J_o·v_o = −J_r·v_r.
         """
         velocities = np.zeros((2, self.chain.size))
+        for name, value in self.task.phases[-1].velocities.items():
+            velocities[1, self.chain.index(name)] = value
         robot_velocity = self.scene.start_velocity
         if not robot_velocity.any():
             return velocities

@@ -47,7 +47,7 @@ from vkc_pin.world.scene.hold import (
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 from vkc_pin.world.scene.poses import as_placement
-from vkc_pin.world.scene.start_velocity import make_start_velocity
+from vkc_pin.world.scene.robot_velocity import make_robot_velocity
 
 if TYPE_CHECKING:
     from vkc_pin.world.models.robot import Base, Robot
@@ -233,7 +233,7 @@ class Scene:
         start[0] = clamp_to_limits(start[0], x_min, x_max, f"base.{names[0]}", problem)
         start[1] = clamp_to_limits(start[1], y_min, y_max, f"base.{names[1]}", problem)
         wanted = self.start_velocity if velocity is None else velocity
-        start_velocity = make_start_velocity(self.robot, start, wanted)
+        start_velocity = make_robot_velocity(self.robot, start, wanted)
         return self._with(start=start, start_velocity=start_velocity)
 
     def _check_start_values(self, values: ArrayLike, field: str, part: slice) -> list[float]:

@@ -41,7 +41,7 @@ from vkc_pin.world.scene.obstacles import (
     move_obstacle_shape,
 )
 from vkc_pin.world.scene.placed_object import PlacedObject
-from vkc_pin.world.scene.start_velocity import make_start_velocity
+from vkc_pin.world.scene.robot_velocity import make_robot_velocity
 
 
 def make_scene_fields(document: Document, folder: Path) -> dict[str, Any]:
@@ -319,7 +319,7 @@ def _make_start_velocity(
             path = ("start", "velocity", name)
             raise document.make_unknown_name_error(path, kind, name, names)
     with document.annotate_errors(("start", "velocity")):
-        return make_start_velocity(robot, start, item.velocity)
+        return make_robot_velocity(robot, start, item.velocity)
 
 
 def _fill_arm(document: Document, given: Mapping[str, float], robot: Robot) -> list[float]:

@@ -22,7 +22,11 @@ from vkc_pin.world.task.actuation import (
     find_shared_coordinate,
     list_driving_attachments,
 )
-from vkc_pin.world.task.configurations import check_pose_is_unambiguous, find_configuration
+from vkc_pin.world.task.configurations import (
+    check_pose_is_unambiguous,
+    find_configuration,
+    find_end_velocities,
+)
 from vkc_pin.world.task.lookup import (
     check_link,
     compute_openings,
@@ -513,8 +517,15 @@ class _Compiler:
     def configure(self, step: Configure, where: str) -> None:
         """Add the phase that brings joints of the robot to values."""
         configuration = find_configuration(self.scene, step, where)
+        velocities = find_end_velocities(self.scene, step, where)
         self._release_fixed_objects()
-        self._append("configure", (), self.options.reach_waypoints, configuration=configuration)
+        self._append(
+            "configure",
+            (),
+            self.options.reach_waypoints,
+            configuration=configuration,
+            velocities=velocities,
+        )
 
     def go(self, step: GoTo) -> None:
         """Add the phase that brings the base to a position."""

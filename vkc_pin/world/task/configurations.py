@@ -10,6 +10,7 @@ from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.models.coordinates import MovedJoint
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.shapes import LIMIT_SLACK
+from vkc_pin.world.scene.robot_velocity import make_robot_velocity
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Configure, Reach
 
@@ -52,6 +53,41 @@ def find_configuration(scene: Scene, step: Configure, where: str) -> dict[str, _
         # Rounding may have exchanged the ends.
         found[name] = (min(low, high), max(low, high))
     return found
+
+
+def find_end_velocities(scene: Scene, step: Configure, where: str) -> dict[str, float]:
+    """Return coordinate of the robot → velocity at the end of a step, where it is not 0.
+
+    A coupled joint p = f · z + o with the velocity v has a leader with the velocity v / f.
+
+    Raises:
+        UnknownNameError: The robot has no such joint.
+        InputError: A joint cannot move, a velocity is beyond its limit, the base cannot move so, or
+            the velocities of coupled joints contradict each other.
+    """
+    robot = scene.robot
+    field = f"{where}.velocities"
+    found = dict[str, float]()
+    for joint, value in step.velocities.items():
+        move = _find_planned_joint(robot, joint, f"{field}[{joint!r}]")
+        name = robot.coordinates.names[move.coordinate]
+        velocity = value / move.factor
+        if not np.isclose(found.setdefault(name, velocity), velocity):
+            problem = f"the coupled joints of '{name}' contradict each other"
+            expected = f"{found[name] * move.factor:g}"
+            raise InputError(problem, field=f"{field}[{joint!r}]", expected=expected, got=value)
+    end = scene.start.copy()
+    intervals = find_configuration(scene, step, where)
+    for name, interval in intervals.items():
+        end[robot.coordinates.index(name)] = np.mean(interval)
+    x_name, y_name, yaw_name = robot.coordinates.names[:3]
+    is_wheeled = robot.base in ("differential", "ackermann")
+    if is_wheeled and {x_name, y_name} & {*found} and yaw_name not in intervals:
+        problem = "a base on wheels moves along its heading"
+        raise InputError(problem, field=f"{where}.joints", expected=f"a value of '{yaw_name}'")
+    checked = make_robot_velocity(robot, end, found, field)
+    moving = zip(robot.coordinates.names, checked.tolist(), strict=True)
+    return {name: velocity for name, velocity in moving if velocity}
 
 
 def check_pose_is_unambiguous(scene: Scene, step: Reach, where: str) -> None:

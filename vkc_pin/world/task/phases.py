@@ -71,6 +71,8 @@ class Phase:
         frames: Frame goals at the last waypoint.
         configuration: Coordinate of the robot → (lower, upper) at the last waypoint. An angle
             without limits may differ by full turns.
+        velocities: Coordinate of the robot → velocity at the last waypoint, which is that of the
+            motion, [m/s] or [rad/s]; all others are 0.
         grasps: Holds that begin at the last waypoint.
         released: Holds that ended just before the phase.
         initial_values: Object coordinate → value at the first waypoint, for the joints that the
@@ -93,6 +95,7 @@ class Phase:
     pushed: Mapping[str, int] = field(default_factory=dict)
     frames: tuple[FrameGoal, ...] = ()
     configuration: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    velocities: Mapping[str, float] = field(default_factory=dict)
     grasps: tuple[Hold, ...] = ()
     released: tuple[Hold, ...] = ()
     initial_values: Mapping[str, float] = field(default_factory=dict)

@@ -190,10 +190,13 @@ class Configure:
             heading, values that differ by full turns are the same.
         tolerance: Largest accepted deviation from the values, [rad] or [m]: one for all joints, or
             joint → deviation; joints without one must be reached exactly.
+        velocities: Joint → velocity with which the motion ends there, [rad/s] or [m/s], where it is
+            not at rest. Only the last step may end in motion.
     """
 
     joints: Mapping[str, float]
     tolerance: float | Mapping[str, float] = 0.0
+    velocities: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         field = "Configure.joints"
@@ -206,6 +209,7 @@ class Configure:
             joints[name] = check_coordinate(value, f"{field}[{name!r}]")
         object.__setattr__(self, "joints", joints)
         object.__setattr__(self, "tolerance", self._check_tolerance())
+        object.__setattr__(self, "velocities", self._check_velocities())
 
     def _check_tolerance(self) -> float | dict[str, float]:
         field = "Configure.tolerance"
@@ -217,6 +221,16 @@ class Configure:
             if name not in self.joints:
                 raise UnknownNameError("joint of this step", name, self.joints, field=field)
             found[name] = check_number(value, f"{field}[{name!r}]", expected, low=0.0)
+        return found
+
+    def _check_velocities(self) -> dict[str, float]:
+        field = "Configure.velocities"
+        expected = "a mapping such as {'elbow_joint': 0.2}"
+        found = dict[str, float]()
+        for name, value in check_mapping(self.velocities, field, expected).items():
+            if name not in self.joints:
+                raise UnknownNameError("joint of this step", name, self.joints, field=field)
+            found[name] = check_number(value, f"{field}[{name!r}]", "a velocity [m/s] or [rad/s]")
         return found
 
     def get_tolerance(self, joint: str) -> float:
@@ -271,6 +285,14 @@ def as_steps(steps: Sequence[Step]) -> tuple[Step, ...]:
             expected = ", ".join(kind.__name__ for kind in STEPS)
             raise InputError(
                 "not a step", field=f"steps[{number}]", expected=expected, got=format_value(step)
+            )
+        is_last = number == len(found) - 1
+        if isinstance(step, Configure) and any(step.velocities.values()) and not is_last:
+            raise InputError(
+                "only the last step may end in motion",
+                field=f"steps[{number}].velocities",
+                expected="velocities of 0, or no further steps",
+                got=dict(step.velocities),
             )
     return found
 

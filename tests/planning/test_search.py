@@ -62,7 +62,7 @@ def test_search_goes_on_until_the_limit(
         return fail(problem, guess)
 
     monkeypatch.setattr(solve_task, "solve", fail_far_away)
-    monkeypatch.setattr(solve_task._Search, "_add_guess", lambda *_: None)
+    monkeypatch.setattr(solve_task.TaskSearch, "_add_guess", lambda *_: None)
     plan = vkc.plan(scene, [goal], options=SHORT, **limit)
     (name,) = limit
     assert plan.status == {"time_limit": "time limit"}.get(name, "evaluation limit")

@@ -57,7 +57,8 @@ def try_alternatives(
         first = search.run(pauses=pauses)
     if first is not None and (first.is_solved or first.is_grasp_independent or current_ending()):
         return first
-    others, notes = list[TaskResult](), list[str]()
+    others = list[TaskResult]()
+    notes = list[str]()
     for number, (name, steps) in enumerate(alternatives()):
         if current_ending():
             break
@@ -69,31 +70,37 @@ def try_alternatives(
             continue
         others.append(other)
         if other.is_solved:
-            every = [search.statistics, *(one.found.statistics for one in others)]
-            return dataclasses.replace(other, found=add_statistics(other.found, every))
+            return _add_up(other, search, others)
         reason = next(iter(other.plan.report.notes), other.plan.status)
-        notes += [f"at {name}: {reason}"] * (reason not in STOP_STATUSES)
+        if reason not in STOP_STATUSES:
+            notes.append(f"at {name}: {reason}")
     if first is None:
         first = search.run()
         assert first is not None
     if first.is_solved or not (others or notes):
-        every = [search.statistics, *(one.found.statistics for one in others)]
-        return dataclasses.replace(first, found=add_statistics(first.found, every))
+        return _add_up(first, search, others)
     return _combine_failures(first, others, notes)
+
+
+def _add_up(result: TaskResult, search: Search, others: Sequence[TaskResult]) -> TaskResult:
+    """Return a result with the statistics of the search for the task and of its alternatives."""
+    statistics = [search.statistics]
+    statistics += [other.found.statistics for other in others]
+    return dataclasses.replace(result, found=add_statistics(result.found, statistics))
 
 
 def _combine_failures(
     first: TaskResult, others: Sequence[TaskResult], notes: Sequence[str]
 ) -> TaskResult:
     """Return the result of a task that failed, as its alternatives did."""
-    plan = first.plan
-    every = [one.plan for one in (first, *others)]
-    is_infeasible = all(one.status == "infeasible" for one in every)
+    results = [first, *others]
+    plans = [result.plan for result in results]
+    plan = plans[0]
     status = plan.status
-    if status == "infeasible" and not is_infeasible:
+    if any(each.status != "infeasible" for each in plans) and status == "infeasible":
         status = "not converged"
     report = dataclasses.replace(plan.report, notes=(*plan.report.notes, *notes))
     failed = dataclasses.replace(plan, report=report, status=current_ending() or status)
-    total = add_statistics(failed, [one.statistics for one in every])
-    is_blocked = all(one.is_goal_blocked for one in (first, *others))
-    return dataclasses.replace(first, found=total, is_goal_blocked=is_blocked)
+    found = add_statistics(failed, [each.statistics for each in plans])
+    is_blocked = all(result.is_goal_blocked for result in results)
+    return dataclasses.replace(first, found=found, is_goal_blocked=is_blocked)

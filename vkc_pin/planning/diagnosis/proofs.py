@@ -18,27 +18,30 @@ from vkc_pin.planning.base_paths.reachable_floor import (
     find_blocked_cells,
     flood_fill,
 )
+from vkc_pin.planning.nlp.pose_goals import PoseGoal
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.world.scene.clearance_exemptions import PlacedShapes, find_clearance_exemptions
 from vkc_pin.world.scene.obstacles import FLOOR
+from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.task.phases import Phase
 
 PROVEN = "proven: "
 """Prefix of the part of a note that is certain."""
 
 _COARSE_CELL = 0.1  # [m] cells for finding a path, which makes a proof unnecessary
-_FINE_CELL, _MAX_CELLS = 0.02, 400_000  # [m] and number of cells for proofs
+_FINE_CELL = 0.02  # [m] cells for proofs
+_MAX_CELLS = 400_000  # of a proof; in a larger arena they are larger
 # [m] by which a base may leave the arena, or a frame miss its goal: more than validation accepts
 _TOLERANCE = 0.02
 _MAX_NAMES = 6  # obstacles named in a message
 _CLOSED_TOLERANCE = 0.05  # [rad], [m] up to which a joint counts as closed
 _BASE = 1  # the joint of the model that is the base
-
-# window of cells, and a mask of those that are blocked
-_Window = tuple[tuple[slice, slice], Bools]
 _CERTAIN_OVERLAP = 1e-3  # [m] more than validation accepts
 _SAMPLES = 200  # joint values between start and goal
+
+# Window of cells, and a mask of those that are blocked.
+_Window = tuple[tuple[slice, slice], Bools]
 
 
 class _BaseGoal(NamedTuple):
@@ -49,11 +52,9 @@ class _BaseGoal(NamedTuple):
 
     def allows(self, cells: CellGrid, grown: float) -> Bools:
         """Return which cell centres are within the radius plus `grown` [m], shape (X, Y)."""
-        x, y = (
-            np.nan_to_num(centers - at)
-            for centers, at in zip(cells.centers(), self.center, strict=True)
-        )
-        return np.asarray(np.hypot(x, y) <= self.radius + grown)
+        x, y = cells.centers()
+        distances = np.hypot(np.nan_to_num(x - self.center[0]), np.nan_to_num(y - self.center[1]))
+        return np.asarray(distances <= self.radius + grown)
 
 
 class _PhaseFloor(NamedTuple):
@@ -73,47 +74,70 @@ def find_proofs(problem: TrajectoryProblem) -> list[str]:
     """
     if problem.chain.robot.base == "fixed":
         return []
-    goals = []
+    goals = list[list[_BaseGoal]]()
     for number, phase in enumerate(problem.task.phases):
         found, beyond = _find_base_goals(problem, number)
         if beyond:
             return [f"{phase.name}: out of reach, {PROVEN}{text}" for text in beyond]
         goals.append(found)
-    low, high = np.array([problem.limits(name) for name in problem.chain.names[:2]]).T
+    for point in _find_tracked_points(problem):
+        explanation = _explain_missing_path_of_point(problem, point, goals)
+        if explanation:
+            return [explanation]
+    return []
+
+
+def _explain_missing_path_of_point(
+    problem: TrajectoryProblem, point: Floats, goals: Sequence[Sequence[_BaseGoal]]
+) -> str:
+    """Explain why a point of the base certainly has no path from goal to goal; empty if it may.
+
+    Args:
+        problem: The problem.
+        point: The point in the base's frame, shape (2,) [m].
+        goals: Goals of the base's origin in each phase.
+    """
+    offset = float(np.hypot(*point))
     x, y, yaw = problem.start[:3].tolist()
     turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-    for point in _find_tracked_points(problem):
-        offset, start = float(np.hypot(*point)), np.array([x, y]) + turn @ point
-        parts = []
-        for number, phase in enumerate(problem.task.phases):
-            own = [_BaseGoal(goal.center, goal.radius + offset) for goal in goals[number]]
-            parts.append(_PhaseFloor(phase, own, *_collect_walls(problem, number, point)))
-        begin, end = low - _TOLERANCE - offset, high + _TOLERANCE + offset
-        step = max(_FINE_CELL, float(np.sqrt(np.prod(end - begin) / _MAX_CELLS)))
-        coarse, fine = (CellGrid.over(begin, end, size) for size in (_COARSE_CELL, step))
-        if any(part.goals for part in parts) and not _has_path(start, parts, coarse):
-            explanation = _explain_missing_path(problem, start, parts, fine)
-            if explanation:
-                return [explanation]
-    return []
+    start = np.array([x, y]) + turn @ point
+    parts = []
+    for number, phase in enumerate(problem.task.phases):
+        # At an unknown heading, the point may be on any side of the origin.
+        own = [_BaseGoal(goal.center, goal.radius + offset) for goal in goals[number]]
+        walls, names = _collect_walls(problem, number, point)
+        parts.append(_PhaseFloor(phase, own, walls, names))
+    if not any(part.goals for part in parts):
+        return ""
+    low, high = np.array([problem.limits(name) for name in problem.chain.names[:2]]).T
+    begin = low - _TOLERANCE - offset
+    end = high + _TOLERANCE + offset
+    if _has_path(start, parts, CellGrid.over(begin, end, _COARSE_CELL)):
+        return ""
+    step = max(_FINE_CELL, float(np.sqrt(np.prod(end - begin) / _MAX_CELLS)))
+    return _explain_missing_path(problem, start, parts, CellGrid.over(begin, end, step))
 
 
 def _find_tracked_points(problem: TrajectoryProblem) -> list[Floats]:
     """Return points of the base to track, (2,) [m] each: its origin, and where it is highest."""
-    robot = problem.chain.robot.collision.geometryObjects
-    solids = make_solids(
-        [(shape.geometry, shape.placement) for shape in robot if shape.parentJoint == _BASE]
-    )
+    shapes = []
+    for shape in problem.chain.robot.collision.geometryObjects:
+        if shape.parentJoint == _BASE:
+            shapes.append((shape.geometry, shape.placement))
+    solids = make_solids(shapes)
     if not solids:
         return []
-    corners = max(solids, key=lambda solid: solid.top).points[:, :2]
+    highest = max(solids, key=lambda solid: solid.top)
+    corners = highest.points[:, :2]
     return [np.zeros(2), (corners.min(axis=0) + corners.max(axis=0)) / 2.0]
 
 
 def _find_base_goals(problem: TrajectoryProblem, number: int) -> tuple[list[_BaseGoal], list[str]]:
     """Return necessary base positions at a phase's end, and reasons why goals are unreachable."""
-    phase, end = problem.task.phases[number], int(problem.ends[number])
-    goals, beyond = [], []
+    phase = problem.task.phases[number]
+    end = int(problem.ends[number])
+    goals = []
+    beyond = []
     names = problem.chain.names[:2]
     if phase.configuration.keys() >= {*names}:
         place = np.array([phase.configuration[name] for name in names])
@@ -122,22 +146,29 @@ def _find_base_goals(problem: TrajectoryProblem, number: int) -> tuple[list[_Bas
     for goal in problem.pose_goals:
         if end not in goal.row.waypoints or goal.row.kind == "level" or goal.row.shift is not None:
             continue
-        frame = goal.row.joint, goal.local.translation
-        shoulder, length = _compute_arm_reach(problem, *frame)
-        at = goal.target.translation
-        height = abs(at[2] - shoulder[2])
+        shoulder, length = _compute_arm_reach(problem, goal.row.joint, goal.local.translation)
+        position = goal.target.translation
+        height = abs(position[2] - shoulder[2])
         if height > length:
-            text = f"{goal.about} at z = {at[2]:.2f} m is {height - length:.3g} m too high or low, "
-            if goal.row.joint > _BASE:
-                text += f"wherever the base is: it turns about a joint at z = {shoulder[2]:.2f} m, "
-                text += f"and the whole arm with it is {length:.2f} m long"
-            else:
-                text += f"since the base keeps it at z = {shoulder[2]:.2f} m"
-            beyond.append(text)
+            beyond.append(_describe_height(goal, shoulder, length))
         elif np.isfinite(length):
+            # At any heading, the shoulder is on a circle about the base's origin.
             radius = float(np.hypot(*shoulder[:2]) + np.sqrt(length**2 - height**2))
-            goals.append(_BaseGoal(at[:2].copy(), radius))
+            goals.append(_BaseGoal(position[:2].copy(), radius))
     return goals, beyond
+
+
+def _describe_height(goal: PoseGoal, shoulder: Floats, length: float) -> str:
+    """Return how far a goal is too high or low for an arm of some length [m]."""
+    z = goal.target.translation[2]
+    beyond = abs(z - shoulder[2]) - length
+    text = f"{goal.about} at z = {z:.2f} m is {beyond:.3g} m too high or low, "
+    if goal.row.joint > _BASE:
+        text += f"wherever the base is: it turns about a joint at z = {shoulder[2]:.2f} m, "
+        text += f"and the whole arm with it is {length:.2f} m long"
+    else:
+        text += f"since the base keeps it at z = {shoulder[2]:.2f} m"
+    return text
 
 
 def _compute_arm_reach(
@@ -145,7 +176,8 @@ def _compute_arm_reach(
 ) -> tuple[Floats, float]:
     """Return the position of a frame's first joint in the base, (3,), and the reach from it [m]."""
     chain = problem.chain
-    model, along = chain.model, [k for k in chain.model.supports[joint] if k > _BASE]
+    model = chain.model
+    along = [k for k in model.supports[joint] if k > _BASE]
     if not along:
         return np.asarray(local), _TOLERANCE
     length = float(np.linalg.norm(local)) + _TOLERANCE
@@ -164,15 +196,21 @@ def _collect_walls(
     part = problem.contacts.phases[number]
     robot = part.shapes[: len(problem.chain.robot.collision.geometryObjects)]
     base = [i for i, shape in enumerate(robot) if shape.parentJoint == _BASE]
-    exempt = {i for own in part.released.values() for i in own} | {
-        int(part.pairs[pair, 1]) for pair in part.reduced_margins if part.pairs[pair, 0] in base
-    }
-    hits = np.bincount(part.pairs[np.isin(part.pairs[:, 0], base), 1], minlength=len(part.shapes))
-    fixed = [
-        i
-        for i, (shape, label) in enumerate(zip(part.shapes, part.labels, strict=True))
-        if shape.parentJoint == 0 and label != FLOOR and hits[i] == len(base) and i not in exempt
-    ]
+    exempt = set[int]()
+    for shapes in part.released.values():
+        exempt.update(shapes)
+    for pair in part.reduced_margins:
+        first, second = part.pairs[pair].tolist()
+        if first in base:
+            exempt.add(second)
+    # A wall is checked against every shape of the base.
+    pairs_of_base = part.pairs[np.isin(part.pairs[:, 0], base)]
+    counts = np.bincount(pairs_of_base[:, 1], minlength=len(part.shapes))
+    fixed = []
+    for i, (shape, label) in enumerate(zip(part.shapes, part.labels, strict=True)):
+        is_fixed = shape.parentJoint == 0 and label != FLOOR and i not in exempt
+        if is_fixed and counts[i] == len(base):
+            fixed.append(i)
     shift = pin.SE3(np.eye(3), -np.array([*point, 0.0]))
     own = [(part.shapes[i].geometry, shift * part.shapes[i].placement) for i in base]
     key = ("discs", *(solid.key for solid in make_solids(own)))
@@ -193,8 +231,8 @@ def _has_path(start: Floats, parts: Sequence[_PhaseFloor], cells: CellGrid) -> b
             key = (wall.outline.tobytes(), wall.radius)
             if key not in known:
                 known[key] = find_blocked_cells(cells, wall, half)
-            window, own = known[key]
-            free[window] &= ~own
+            window, blocked = known[key]
+            free[window] &= ~blocked
         here = flood_fill(free, here & free, corners=False)
         for goal in part.goals:
             here &= goal.allows(cells, 0.0)
@@ -215,8 +253,8 @@ def _explain_missing_path(
             if own.any():
                 blocked.setdefault(wall.number, []).append((window, own))
         goal = np.ones(cells.shape, bool)
-        for one in part.goals:
-            goal &= one.allows(cells, half)
+        for base_goal in part.goals:
+            goal &= base_goal.allows(cells, half)
         count = np.zeros(cells.shape, np.int16)
         _add_windows(count, itertools.chain.from_iterable(blocked.values()), 1)
         reached = flood_fill(count == 0, here, corners=True)
@@ -286,37 +324,44 @@ def _minimize_obstacles(
         count: Number of obstacles that block each cell, shape (X, Y).
     """
     kept = set(blocked)
-    seen = {
-        number
-        for number, windows in blocked.items()
-        if any((own & near[window]).any() for window, own in windows)
-    }
-    order = [*sorted(seen), *sorted(kept - seen)]
-    for some in (kept - seen, *({number} for number in order)):
-        some = some & kept
+    preferred = set[int]()
+    for number, windows in blocked.items():
+        if any((own & near[window]).any() for window, own in windows):
+            preferred.add(number)
+    others = kept - preferred
+    # All others at once, then one obstacle after the other.
+    groups = [others]
+    groups += [{number} for number in (*sorted(preferred), *sorted(others))]
+    for group in groups:
+        removed = group & kept
+        if not removed:
+            continue
         less = count.copy()
-        _add_windows(less, itertools.chain.from_iterable(blocked[number] for number in some), -1)
-        if some and suffices(less == 0):
-            count, kept = less, kept - some
+        for number in removed:
+            _add_windows(less, blocked[number], -1)
+        if suffices(less == 0):
+            count = less
+            kept -= removed
     return sorted(kept)
 
 
 def _list_names(problem: TrajectoryProblem, phase: Phase, names: Sequence[str]) -> str:
     """List names in a sentence, with the joint positions of articulated objects among them."""
-    found = list(dict.fromkeys(names))
-    more = f" and {len(found) - _MAX_NAMES} more" if len(found) > _MAX_NAMES else ""
-    text = ", ".join(found[:_MAX_NAMES]) + more
-    for name in dict.fromkeys(label.partition(".")[0] for label in found):
+    distinct = list(dict.fromkeys(names))
+    text = ", ".join(distinct[:_MAX_NAMES])
+    if len(distinct) > _MAX_NAMES:
+        text += f" and {len(distinct) - _MAX_NAMES} more"
+    for name in dict.fromkeys(label.partition(".")[0] for label in distinct):
         placed = problem.scene.objects.get(name)
         if placed is None or placed.object.free or not len(placed.state):
             continue
-        state = {
-            joint: phase.initial_values.get(f"{name}.{joint}", float(value))
-            for joint, value in zip(placed.object.coordinates.names, placed.state, strict=True)
-        }
-        is_closed = max(map(abs, state.values())) < _CLOSED_TOLERANCE
-        values = ", ".join(f"at {joint} = {value:.2f}" for joint, value in state.items())
-        text += f"; {name} is {'closed' if is_closed else values} meanwhile"
+        state = {}
+        for joint, value in zip(placed.object.coordinates.names, placed.state, strict=True):
+            state[joint] = phase.initial_values.get(f"{name}.{joint}", float(value))
+        values = "closed"
+        if max(map(abs, state.values())) >= _CLOSED_TOLERANCE:
+            values = ", ".join(f"at {joint} = {value:.2f}" for joint, value in state.items())
+        text += f"; {name} is {values} meanwhile"
     return text
 
 
@@ -335,62 +380,100 @@ def find_swept_collisions(problem: TrajectoryProblem) -> list[str]:
 
 def _find_collision(problem: TrajectoryProblem, phase: Phase, coordinate: str) -> str:
     """Return which link a joint moves into what in a phase; empty if no collision is certain."""
-    scene, (name, _, joint) = problem.scene, coordinate.partition(".")
-    placed = scene.objects[name]
+    name, _, joint = coordinate.partition(".")
+    placed = problem.scene.objects[name]
     if placed.object.free:
         return ""
     begin = phase.initial_values[coordinate]
     end = float(np.clip(phase.values[coordinate], *problem.limits(coordinate)))
     values = np.linspace(begin, end, _SAMPLES)
-    # Objects that no hand moves are where the scene has them; of others only the fixed links are.
-    task = problem.task
-    moved = {hold.object for hold in task.holds} | {one.object for one in task.supported}
-    objects = {
-        owner: one
-        for owner, one in scene.objects.items()
-        if owner not in moved or not one.object.free
-    }
-    shapes = PlacedShapes(scene, objects)
-    exemptions = find_clearance_exemptions(scene, problem.options.dist_safe)
-    links = {
-        f"{owner}.{link}": shapes.find_joints(f"{owner}.{link}")
-        for owner, one in objects.items()
-        for link in one.object.links
-    }
-    swept = [f"{name}.{link}" for link in placed.object.links if links[f"{name}.{link}"] == [joint]]
-    others = set(scene.obstacle_labels) - {FLOOR}
-    for label, joints in links.items():
-        owner = label.partition(".")[0]
-        if owner != name and (owner not in moved or not joints):
-            others.add(label)
-    states = {
-        f"{owner}.{own_joint}": np.full(_SAMPLES, value)
-        for owner, one in objects.items()
-        for own_joint, value in zip(one.object.coordinates.names, one.state, strict=True)
-    }
-    states[coordinate] = values
-    names, rows = list(states), np.column_stack(list(states.values()))
-    deepest, text = -_CERTAIN_OVERLAP, ""
-    index = placed.object.coordinates.index(joint)
-    for label in swept:
-        for other in sorted(others & shapes.find_links_near_sweep(label, index, values)):
-            own, hit = shapes.find_shapes([label]), shapes.find_shapes([other])
-            distances = shapes.compute_distances(label, index, values, hit, 0.0)
-            for one in exemptions:
-                if not one.is_between(label, other):
-                    continue
-                is_active = one.is_active(names, rows)
-                pairs = set(one.find_shape_pairs(shapes.labels, shapes.keys))
-                for k, j in itertools.product(range(len(own)), range(len(hit))):
-                    if (min(own[k], hit[j]), max(own[k], hit[j])) in pairs:
-                        distances[is_active, k, j] += max(0.0, -one.margin)
-            distance = distances.min(axis=(1, 2))
-            worst = int(np.argmin(distance))
-            if distance[worst] < deepest:
-                deepest = float(distance[worst])
-                first = values[np.argmax(distance < -_CERTAIN_OVERLAP)]
+    sweep = _Sweep(problem, placed, joint, values)
+    deepest = -_CERTAIN_OVERLAP
+    text = ""
+    for label in sweep.links:
+        for other in sweep.find_obstacles(label):
+            distances = sweep.compute_distances(label, other)
+            worst = int(np.argmin(distances))
+            if distances[worst] < deepest:
+                deepest = float(distances[worst])
+                first = values[np.argmax(distances < -_CERTAIN_OVERLAP)]
                 text = (
                     f"between {begin:.3g} and {end:.3g}, at {values[worst]:.3g}, {label} – {other} "
                     f"overlap by {-1e3 * deepest:.1f} mm, and first at {first:.3g}"
                 )
     return text
+
+
+class _Sweep:
+    """Motion of one joint of an object, among all that stays where it is meanwhile.
+
+    Args:
+        problem: The problem.
+        placed: The object.
+        joint: Its joint.
+        values: Positions of the joint, shape (`_SAMPLES`,).
+
+    Attributes:
+        links: Labels of the links that this joint alone moves.
+    """
+
+    def __init__(
+        self, problem: TrajectoryProblem, placed: PlacedObject, joint: str, values: Floats
+    ) -> None:
+        scene = problem.scene
+        task = problem.task
+        # Objects that no hand moves are where the scene has them; of others only the fixed links
+        # are.
+        moved = {hold.object for hold in task.holds}
+        moved |= {supported.object for supported in task.supported}
+        objects = {}
+        for owner, item in scene.objects.items():
+            if owner not in moved or not item.object.free:
+                objects[owner] = item
+        self._shapes = PlacedShapes(scene, objects)
+        self._exemptions = find_clearance_exemptions(scene, problem.options.dist_safe)
+        self._index = placed.object.coordinates.index(joint)
+        self._values = values
+        self.links = []
+        self._others = set(scene.obstacle_labels) - {FLOOR}
+        for owner, item in objects.items():
+            for link in item.object.links:
+                label = f"{owner}.{link}"
+                joints = self._shapes.find_joints(label)
+                if owner == placed.name and joints == [joint]:
+                    self.links.append(label)
+                if owner != placed.name and (owner not in moved or not joints):
+                    self._others.add(label)
+        states = dict[str, Floats]()
+        for owner, item in objects.items():
+            for own_joint, value in zip(item.object.coordinates.names, item.state, strict=True):
+                states[f"{owner}.{own_joint}"] = np.full(_SAMPLES, value)
+        states[f"{placed.name}.{joint}"] = values
+        self._coordinates = list(states)
+        self._states = np.column_stack(list(states.values()))
+
+    def find_obstacles(self, label: str) -> list[str]:
+        """Return what a link passes by closely, in the order of names."""
+        near = self._shapes.find_links_near_sweep(label, self._index, self._values)
+        return sorted(self._others & near)
+
+    def compute_distances(self, label: str, other: str) -> Floats:
+        """Return the distance between two links at each position, shape (`_SAMPLES`,) [m].
+
+        Where an exemption allows an overlap, that much is added to it.
+        """
+        shapes = self._shapes
+        own = shapes.find_shapes([label])
+        hit = shapes.find_shapes([other])
+        distances = shapes.compute_distances(label, self._index, self._values, hit, 0.0)
+        for exemption in self._exemptions:
+            if not exemption.is_between(label, other):
+                continue
+            is_active = exemption.is_active(self._coordinates, self._states)
+            pairs = set(exemption.find_shape_pairs(shapes.labels, shapes.keys))
+            allowed = max(0.0, -exemption.margin)
+            for k, j in itertools.product(range(len(own)), range(len(hit))):
+                pair = (min(own[k], hit[j]), max(own[k], hit[j]))
+                if pair in pairs:
+                    distances[is_active, k, j] += allowed
+        return np.asarray(distances.min(axis=(1, 2)))

@@ -24,13 +24,13 @@ from helpers.carrying import (
 from helpers.drawers import add_boxes, compute_tool_pose
 from helpers.judging import replace_object
 from helpers.litter import BIN_POSITION, LITTER_POSITION, describe_shelf, make_littered_scene
+from helpers.schedules import plan_each_step
 from helpers.small_problems import make_full_scene
 
 import vkc_pin as vkc
 from tests.benchmarks.robot_object_matrix.pairs import load_description, make_hall
 from vkc_pin.experiments.initialization import TARGET
 from vkc_pin.planning.request import PlanningRequest
-from vkc_pin.planning.sequential import plan_each_step
 from vkc_pin.validation.validate import validate
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene

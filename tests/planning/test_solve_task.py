@@ -12,6 +12,7 @@ from helpers.carrying import describe_box, describe_table, lift, make_room
 from helpers.drawers import SHORT, replace_scene_fields
 from helpers.drives import make_hall
 from helpers.gates import make_gate_problem
+from helpers.schedules import solve_task
 from helpers.small_problems import load_door_scene
 
 import vkc_pin as vkc
@@ -19,7 +20,7 @@ from tests.benchmarks.problems.problem_set import problem as make_random_problem
 from vkc_pin.planning.initialization.initial_guess import InitialGuess
 from vkc_pin.planning.request import PlanningRequest
 from vkc_pin.planning.results import Draft
-from vkc_pin.planning.solve_task import TaskResult, solve_task
+from vkc_pin.planning.solve_task import TaskResult
 from vkc_pin.world.task.compiler import compile_task
 
 OPEN = [vkc.Actuate("door", {"hinge": 1.2})]

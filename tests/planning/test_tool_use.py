@@ -6,13 +6,13 @@ from functools import cache
 
 import numpy as np
 import pytest
+from helpers.schedules import plan_each_step, solve_task
 
 import vkc_pin as vkc
 from vkc_pin.experiments.initialization import TARGET
 from vkc_pin.planning.initialization.initial_guess import InitialGuess, make_initial_guess
 from vkc_pin.planning.request import PlanningRequest
-from vkc_pin.planning.sequential import plan_each_step
-from vkc_pin.planning.solve_task import TaskResult, solve_task
+from vkc_pin.planning.solve_task import TaskResult
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.trajectory.world_model import compute_final_scene
 

@@ -4,57 +4,66 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Sequence
-from typing import Protocol
+from collections.abc import Callable, Collection, Iterator, Sequence
 
 from vkc_pin.errors import InputError
-from vkc_pin.planning.plan import PlanningStatistics
-from vkc_pin.planning.results import add_statistics
-from vkc_pin.planning.solve_task import TaskResult
+from vkc_pin.planning.request import PlanningRequest
+from vkc_pin.planning.schedule import Schedule, solve
+from vkc_pin.planning.solve_task import TaskResult, TaskSearch
 from vkc_pin.utils.budget import STOP_STATUSES, current_ending, share_budget
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.actions import generate_alternatives, generate_regrasps
+from vkc_pin.world.task.actuation import find_shared_coordinate
+from vkc_pin.world.task.compiler import compile_task
+from vkc_pin.world.task.phases import Task
 from vkc_pin.world.task.steps import Step
 
-Alternatives = Iterable[tuple[str, tuple[Step, ...]]]
-"""Names of alternatives, such as "cup.top", and their steps."""
+PlanApart = Callable[[Scene, Task, PlanningRequest], Schedule[TaskResult]]
+"""Plans the steps of a task one after the other."""
 
 
-class Search(Protocol):
-    """Search for the solution of a task, such as `TaskSearch`."""
-
-    @property
-    def statistics(self) -> PlanningStatistics:
-        """Statistics so far."""
-
-    def run(self, *, pauses: bool = False) -> TaskResult | None:
-        """Search on. Returns the result; None at a pause, if it may pause."""
-
-
-def try_alternatives(
-    search: Search,
-    list_alternatives: Callable[[], Alternatives],
-    solve: Callable[[Sequence[Step]], TaskResult],
+def solve_with_alternatives(
+    scene: Scene,
+    task: Task,
+    requests: Sequence[PlanningRequest],
     *,
-    pauses: bool,
-) -> TaskResult:
-    """Solve a task; if that fails, its alternatives.
+    named: Collection[str] = (),
+    plan_apart: PlanApart | None = None,
+) -> Schedule[TaskResult]:
+    """Solve a task; if that fails, with each of the other attachments that its steps leave open.
 
-    What costs least comes first: the search for the task itself pauses as soon as its first initial
-    guess has failed, if its goals seem to be blocked, and goes on only when all alternatives have
-    failed. Of these, `solve` should reject the ones with blocked goals before it searches.
+    What costs least comes first: the search for the task itself may pause after its first initial
+    guess, if its goals seem to be blocked, and goes on only when all alternatives have failed. Of
+    these, attachments without a known collision-free configuration at the end of a phase are
+    skipped.
 
     Args:
-        search: Search for the solution of the task itself.
-        list_alternatives: Lists the alternatives; called only if they are needed.
-        solve: Solves the steps of an alternative. An `InputError` rejects it.
-        pauses: Whether the search may pause.
+        scene: Scene in which it starts.
+        task: The task.
+        requests: Arguments of planning, tried in turn; see `schedule.solve`.
+        named: Objects that are held at attachments that the user has named.
+        plan_apart: Plans an alternative whose holds cannot be in one chain, as where an object is
+            grasped anew whose measured grasp deviates. None: the result must be one problem with
+            as many steps. Otherwise a grasped object that cannot be moved with its present grasp is
+            released and grasped anew, and the search for the task itself may pause.
 
     Returns:
-        The first success; if all fail, the result of the task itself, with notes on the others.
-        Its status is "infeasible" only if that holds for all.
+        The first success, whose steps name the attachment unless it is the default; if all fail,
+        the result of the task itself, with notes on the others. Its status is "infeasible" only if
+        that holds for all.
     """
-    alternatives = functools.cache(lambda: tuple(list_alternatives()))
+    may_regrasp = plan_apart is not None
+    alternatives = functools.cache(
+        lambda: tuple(_generate_steps(scene, task, requests[0], named, may_regrasp=may_regrasp))
+    )
+    first: TaskResult | None
+    pauses = plan_apart is not None and len(task.open_attachments) == 1
+    search = TaskSearch(scene, task, requests[0], pauses=pauses)
     with share_budget(lambda: 1 + len(alternatives())):
-        first = search.run(pauses=pauses)
+        if pauses:
+            first = yield search
+        else:
+            first = yield from solve(scene, task, requests)
     if first is not None and (first.is_solved or first.is_grasp_independent or current_ending()):
         return first
     others = list[TaskResult]()
@@ -64,43 +73,67 @@ def try_alternatives(
             break
         try:
             with share_budget(len(alternatives()) - number):
-                other = solve(steps)
+                other = yield from _solve_steps(scene, steps, requests, plan_apart)
         except InputError as error:
             notes.append(f"at {name}: {error}")
             continue
-        others.append(other)
         if other.is_solved:
-            return _add_up(other, search, others)
+            return other
+        others.append(other)
         reason = next(iter(other.plan.report.notes), other.plan.status)
         if reason not in STOP_STATUSES:
             notes.append(f"at {name}: {reason}")
     if first is None:
-        first = search.run()
+        first = yield search
         assert first is not None
     if first.is_solved or not (others or notes):
-        return _add_up(first, search, others)
+        return first
     return _combine_failures(first, others, notes)
 
 
-def _add_up(result: TaskResult, search: Search, others: Sequence[TaskResult]) -> TaskResult:
-    """Return a result with the statistics of the search for the task and of its alternatives."""
-    statistics = [search.statistics]
-    statistics += [other.found.statistics for other in others]
-    return dataclasses.replace(result, found=add_statistics(result.found, statistics))
+def _generate_steps(
+    scene: Scene,
+    task: Task,
+    request: PlanningRequest,
+    named: Collection[str],
+    *,
+    may_regrasp: bool,
+) -> Iterator[tuple[str, tuple[Step, ...]]]:
+    """Yield names of alternatives, such as "cup.top", and their steps."""
+    # Terms may name phases by their numbers, which grasping anew would change.
+    if may_regrasp and len(task.steps) == 1 and not request.terms:
+        yield from generate_regrasps(scene, task, request.options, named)
+    yield from generate_alternatives(task)
+
+
+def _solve_steps(
+    scene: Scene,
+    steps: Sequence[Step],
+    requests: Sequence[PlanningRequest],
+    plan_apart: PlanApart | None,
+) -> Schedule[TaskResult]:
+    """Solve the steps of an alternative.
+
+    Raises:
+        InputError: They are impossible in the scene, or no problem of the kind that is wanted.
+    """
+    task = compile_task(scene, steps, requests[0].options)
+    if find_shared_coordinate(scene, task.holds) is None:
+        return (yield from solve(scene, task, requests, check_goals_first=True))
+    if plan_apart is None:
+        raise InputError("its grasps cannot be part of one problem")
+    return (yield from plan_apart(scene, task, requests[0]))
 
 
 def _combine_failures(
     first: TaskResult, others: Sequence[TaskResult], notes: Sequence[str]
 ) -> TaskResult:
     """Return the result of a task that failed, as its alternatives did."""
-    results = [first, *others]
-    plans = [result.plan for result in results]
-    plan = plans[0]
+    plan = first.plan
     status = plan.status
-    if any(each.status != "infeasible" for each in plans) and status == "infeasible":
+    if any(other.plan.status != "infeasible" for other in others) and status == "infeasible":
         status = "not converged"
     report = dataclasses.replace(plan.report, notes=(*plan.report.notes, *notes))
     failed = dataclasses.replace(plan, report=report, status=current_ending() or status)
-    found = add_statistics(failed, [each.statistics for each in plans])
-    is_blocked = all(result.is_goal_blocked for result in results)
-    return dataclasses.replace(first, found=found, is_goal_blocked=is_blocked)
+    is_blocked = all(result.is_goal_blocked for result in (first, *others))
+    return dataclasses.replace(first, found=failed, is_goal_blocked=is_blocked)

@@ -11,23 +11,18 @@ import numpy as np
 
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
-from vkc_pin.planning.initialization.initial_guess import make_guess_from_motion
 from vkc_pin.planning.initialization.methods import Initialization
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner, acquire_cache
 from vkc_pin.planning.progress import show_progress
 from vkc_pin.planning.request import PlanningRequest, make_budget, make_request
-from vkc_pin.planning.results import FINAL, add_statistics
-from vkc_pin.planning.sequential import (
-    plan_sequentially,
-    plan_simultaneously,
-    solve_with_alternatives,
-)
-from vkc_pin.planning.solve_task import solve_task
+from vkc_pin.planning.results import FINAL
+from vkc_pin.planning.schedule import Schedule, carry_out
+from vkc_pin.planning.sequential import plan_as_one, plan_from_motion, plan_sequentially
 from vkc_pin.planning.solver.solution import Iteration
 from vkc_pin.planning.window import plan_with_window
 from vkc_pin.utils.arguments import check_bool, check_instance, check_integer
-from vkc_pin.utils.budget import Budget, current_ending, share_budget
+from vkc_pin.utils.budget import Budget
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.actions import compile_each_step
 from vkc_pin.world.task.actuation import find_shared_coordinate
@@ -242,8 +237,9 @@ class PreparedTask:
             ready = scene.with_approaches(dict.fromkeys(holds), stacklevel=4)
             if ready is not scene:
                 tasks = self._compile(ready)
-            search = functools.partial(self._search, ready, tasks)
-            found = _search_repeatedly(search, request, budget)
+            plan_once = functools.partial(self._plan_once, ready, tasks)
+            found = carry_out(_plan_repeatedly(plan_once, request, budget))
+            found = dataclasses.replace(found, statistics=request.log.statistics)
             found = _add_note_on_ending(found, budget)
             found = _add_note_on_hand(found, tasks)
             line.end(found)
@@ -255,8 +251,9 @@ class PreparedTask:
         each = self.window is not None
         return _compile(scene, self.steps, self.options, self.terms, each=each)
 
-    def _search(self, scene: Scene, tasks: Sequence[Task], request: PlanningRequest) -> Plan:
-        """Plan the steps once."""
+    def _plan_once(
+        self, scene: Scene, tasks: Sequence[Task], request: PlanningRequest
+    ) -> Schedule[Plan]:
         if self.window is not None:
             return plan_with_window(scene, self.steps, self.window, request)
         (task,) = tasks
@@ -265,8 +262,8 @@ class PreparedTask:
         if not self.simultaneous or not is_one_problem:
             return plan_sequentially(scene, task, request)
         if request.guess is not None:
-            return _plan_from_guess(scene, task, request)
-        return _plan_as_one_problem(scene, task, request)
+            return plan_from_motion(scene, task, request)
+        return plan_as_one(scene, task, request)
 
 
 def _compile(
@@ -292,48 +289,30 @@ def _compile(
     return tasks
 
 
-def _plan_as_one_problem(scene: Scene, task: Task, request: PlanningRequest) -> Plan:
-    if len(task.steps) == 1:
-        return solve_with_alternatives(scene, task, request).plan
-    return plan_simultaneously(scene, task, request)
+def _plan_repeatedly(
+    plan_once: Callable[[PlanningRequest], Schedule[Plan]],
+    request: PlanningRequest,
+    budget: Budget,
+) -> Schedule[Plan]:
+    """Plan until a plan is a success or proven to be impossible, or until the budget ends.
 
-
-def _plan_from_guess(scene: Scene, task: Task, request: PlanningRequest) -> Plan:
-    """Plan steps from the motion of the request; if that fails, by the usual search."""
-    assert request.guess is not None
-    guess = functools.partial(make_guess_from_motion, motion=request.guess)
-    with share_budget(2):
-        first = solve_task(scene, task, request, guess=guess).plan
-    if first.success or current_ending():
-        return first
-    second = _plan_as_one_problem(scene, task, dataclasses.replace(request, guess=None))
-    return add_statistics(second, [first.statistics, second.statistics])
-
-
-def _search_repeatedly(
-    search: Callable[[PlanningRequest], Plan], request: PlanningRequest, budget: Budget
-) -> Plan:
-    """Search until a plan is a success or proven to be impossible, or until the budget ends.
-
-    Every search doubles the collision checks of trees, and draws other random numbers.
+    Every repetition doubles the collision checks of trees, and draws other random numbers.
     """
-    first = search(request)
-    plans = [first]
+    first = yield from plan_once(request)
+    last = first
     seeds = np.random.SeedSequence(request.random_seed)
     goes_on = request.initialization == "auto" and budget.is_limited
-    while goes_on and not plans[-1].success and plans[-1].status not in FINAL:
+    while goes_on and not last.success and last.status not in FINAL:
         before = budget.evaluations
         (other,) = seeds.spawn(1)
         seed = int(other.generate_state(1)[0])
         request = dataclasses.replace(request, random_seed=seed, effort=2 * request.effort)
-        plans.append(search(request))
+        last = yield from plan_once(request)
         goes_on = budget.evaluations > before
+    if last.success or last.status == "infeasible":
+        return dataclasses.replace(last, seed=first.seed)
     # The first failure has the reasons; later ones end in the middle of a search.
-    last = plans[-1]
-    best = last if last.success or last.status == "infeasible" else first
-    status = best.status if best.status in ("success", "infeasible") else last.status
-    best = dataclasses.replace(best, status=status, seed=first.seed)
-    return add_statistics(best, [each.statistics for each in plans])
+    return dataclasses.replace(first, status=last.status)
 
 
 def _add_note_on_ending(found: Plan, budget: Budget) -> Plan:

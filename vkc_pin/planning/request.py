@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from vkc_pin.errors import InputError, format_value
 from vkc_pin.options import Options
 from vkc_pin.planning.initialization.methods import INITIALIZATIONS
-from vkc_pin.planning.plan import Plan
+from vkc_pin.planning.plan import Plan, PlanningStatistics
 from vkc_pin.planning.progress import Progress
 from vkc_pin.planning.solver.solution import Iteration
 from vkc_pin.utils.arguments import (
@@ -32,6 +32,23 @@ MAX_PERTURBATION = 3.0
 """Largest standard deviation of noise on initial guesses, [m] and [rad]."""
 
 
+@dataclass
+class SearchLog:
+    """What all searches of a planning call have done so far.
+
+    Attributes:
+        statistics: Sum of their times and counts, and of those of validating joined plans.
+        history: One row per round of the solver, in all of them.
+    """
+
+    statistics: PlanningStatistics = field(default_factory=PlanningStatistics)
+    history: list[Mapping[str, float]] = field(default_factory=list)
+
+    def add(self, statistics: PlanningStatistics) -> None:
+        """Add times and counts."""
+        self.statistics += statistics
+
+
 @dataclass(frozen=True)
 class PlanningRequest:
     """Checked arguments of one planning call; see `plan`.
@@ -44,6 +61,7 @@ class PlanningRequest:
         effort: Factor of the collision checks of searches with trees; see `plan`.
         is_tentative: Whether planning gives up if the goals of its first initial guess seem to be
             blocked, as steps before can be planned again with another grasp.
+        log: What the searches of the call have done; requests derived from this one share it.
     """
 
     initialization: str
@@ -59,6 +77,7 @@ class PlanningRequest:
     explains: bool = True
     wants_draft: bool = False
     is_tentative: bool = False
+    log: SearchLog = field(default_factory=SearchLog)
 
 
 def make_request(

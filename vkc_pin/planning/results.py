@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TypeVar
 
 import numpy as np
 
@@ -32,8 +31,6 @@ FINAL = (*STOP_STATUSES, "infeasible")
 
 CURVELESS = ("torque", "support", "payload")
 """Constraints that do not depend on the curve between waypoints."""
-
-Found = TypeVar("Found", bound="Plan | Draft")
 
 MAX_REPAIRS = 3
 """Largest number of refinements; each brings the curve four times as close to the segments."""
@@ -98,23 +95,12 @@ class Draft:
         )
 
 
-def sum_statistics(parts: Iterable[PlanningStatistics]) -> PlanningStatistics:
-    """Return the sum of statistics."""
-    return sum(parts, start=PlanningStatistics())
-
-
-def add_statistics(found: Found, parts: Iterable[PlanningStatistics]) -> Found:
-    """Return a plan or draft with the sum of the statistics of several."""
-    return dataclasses.replace(found, statistics=sum_statistics(parts))
-
-
 def concatenate_plans(
     scene: Scene,
     steps: Sequence[Step],
     request: PlanningRequest,
     parts: Sequence[Plan],
     *,
-    began: float | None = None,
     statistics: Sequence[PlanningStatistics] | None = None,
     notes: Sequence[str] = (),
     history: Sequence[Mapping[str, float]] | None = None,
@@ -126,39 +112,39 @@ def concatenate_plans(
     Args:
         scene: Scene in which the first part starts.
         steps: Steps of all parts.
-        request: Arguments of planning.
+        request: Arguments of planning; its log receives the time of the validation.
         parts: The plans, each from the end of the one before.
-        began: Value of `time.perf_counter()` from which planning time counts; None: the sum of
-            `statistics` and the validation.
         statistics: Statistics of the parts; None: taken from them. The validation is added.
         notes: Notes for the report, before those of the last part.
         history: One row per round of the solver; None: taken from the parts.
     """
-    total = sum_statistics(
-        [part.statistics for part in parts] if statistics is None else statistics
-    )
-    rows = [row for part in parts for row in part.history] if history is None else history
+    if statistics is None:
+        statistics = [part.statistics for part in parts]
+    if history is None:
+        history = [row for part in parts for row in part.history]
+    total = sum(statistics, start=PlanningStatistics())
     if parts:
         request.progress.set_activity("checking all of it")
-        failure = "rejected" if parts[-1].success else parts[-1].status
-        status: str = current_ending() or failure
         trajectory = concatenate_trajectories(
             [part.trajectory for part in parts], pause=request.options.grasp_time
         )
-        name = ", ".join(part.initialization for part in parts)
+        status: str = "rejected" if parts[-1].success else parts[-1].status
+        initialization = ", ".join(part.initialization for part in parts)
     else:
         trajectory = make_stationary_trajectory(scene, request.options)
-        status, name = current_ending() or "interrupted", "none"
-    start = time.perf_counter()
+        status = "interrupted"
+        initialization = "none"
+    status = current_ending() or status
+    began = time.perf_counter()
     report = validate(scene, steps, trajectory, request.options, request.terms)
-    took = time.perf_counter() - start
+    took = time.perf_counter() - began
     if parts:
-        total += PlanningStatistics(planning_time=took, validation_time=took)
+        validation = PlanningStatistics(planning_time=took, validation_time=took)
+        request.log.add(validation)
+        total += validation
         report = dataclasses.replace(report, notes=(*notes, *_list_reasons(parts[-1])))
-        status = "success" if report.ok else status
-    if began is not None:
-        planning_time = time.perf_counter() - began - total.build_time
-        total = dataclasses.replace(total, planning_time=planning_time)
+        if report.ok:
+            status = "success"
     return Plan(
         scene,
         tuple(steps),
@@ -168,9 +154,9 @@ def concatenate_plans(
         status,
         statistics=total,
         seed=request.random_seed,
-        initialization=name,
+        initialization=initialization,
         is_optimized=all(part.is_optimized for part in parts),
-        history=tuple(rows),
+        history=tuple(history),
         terms=request.terms,
     )
 

@@ -104,21 +104,6 @@ class TaskResult:
         return extract_phase_waypoints(self.problem, self.z, self.found.initialization)
 
 
-def solve_task(
-    scene: Scene,
-    task: Task,
-    request: PlanningRequest,
-    *,
-    guess: Guess | None = None,
-    check_goals_first: bool = False,
-) -> TaskResult:
-    """Solve a task as one nonlinear program; see `TaskSearch`."""
-    search = TaskSearch(scene, task, request, guess, check_goals_first=check_goals_first)
-    result = search.run()
-    assert result is not None
-    return result
-
-
 @dataclass(frozen=True, eq=False)
 class _Attempt:
     """Initial guess of a problem, and how often the phases of the problem have been refined."""
@@ -142,9 +127,11 @@ class TaskSearch:
         guess: Makes the only initial guess; None: those of the request's initialization.
         check_goals_first: Whether to look for collision-free goal configurations before any initial
             guess, since there are probably none.
+        pauses: Whether to pause after the first initial guess if it fails and its goal
+            configurations are not free of collisions, so that others may be cheaper.
 
     Attributes:
-        statistics: Statistics so far.
+        statistics: Statistics so far; `run` also adds them to the request's log.
     """
 
     def __init__(
@@ -155,6 +142,7 @@ class TaskSearch:
         guess: Guess | None = None,
         *,
         check_goals_first: bool = False,
+        pauses: bool = False,
     ) -> None:
         self.statistics = PlanningStatistics()
         self._scene = scene
@@ -162,6 +150,7 @@ class TaskSearch:
         self._request = request
         self._guess = guess
         self._check_goals_first = check_goals_first
+        self._pauses = pauses
         self._counts = SearchCounts()
         self._candidates = CandidateMaker(scene, task, request, self._counts)
         self._diagnosis = TaskDiagnosis(request.random_seed)
@@ -177,15 +166,11 @@ class TaskSearch:
         self._blocked_phases: list[str] = []  # explanations of phases without a path of the base
         self._is_goal_blocked = False
 
-    def run(self, *, pauses: bool = False) -> TaskResult | None:
-        """Search for a solution, from the last pause on.
-
-        Args:
-            pauses: Whether to pause after the first initial guess if it fails and its goal
-                configurations are not free of collisions, so that others may be cheaper.
+    def run(self) -> TaskResult | None:
+        """Search for a solution, or go on with it after the pause.
 
         Returns:
-            The result; None at a pause.
+            The result; None at the pause.
         """
         outcome: _Outcome | None = None
         with self._count_statistics():
@@ -195,7 +180,10 @@ class TaskSearch:
                     problem = self._build_problem(self._task)
                     self._problem = problem
                     outcome = self._begin(problem)
-                while outcome is None and not (pauses and self._is_first_guess_blocked(problem)):
+                while outcome is None:
+                    if self._pauses and self._is_first_guess_blocked(problem):
+                        self._pauses = False
+                        break
                     attempt = self._choose_attempt(problem)
                     if attempt is None:
                         outcome = self._explain_failure(problem)
@@ -230,7 +218,9 @@ class TaskSearch:
             build_time=build_time,
             evaluations=count_evaluations() - evaluated,
         )
-        self.statistics = self.statistics + took + self._counts.take()
+        took += self._counts.take()
+        self.statistics += took
+        request.log.add(took)
 
     def _begin(self, problem: TrajectoryProblem) -> _Outcome | None:
         """Return the outcome if the problem has no solution, as far as is known at once."""
@@ -458,6 +448,7 @@ class TaskSearch:
         if status in STOP_STATUSES:
             best = best.with_notes(best.describe_shortfall())
         history = tuple(self._history)
+        request.log.history += history
         found: Plan | Draft
         if best.is_draft:
             found = Draft(

@@ -592,6 +592,11 @@ def get_cached(scene: _Scene, key: Hashable, make: Callable[[], T]) -> T:
     return found
 
 
-def make_state_key(placed: PlacedObject) -> tuple[bytes, bytes]:
-    """Return a key of an object's placement and joint values."""
-    return placed.placement.homogeneous.tobytes(), placed.state.tobytes()
+def make_state_key(placed: PlacedObject) -> tuple[bytes, ...]:
+    """Return a key of an object's placement, joint values and measured joints."""
+    key = [placed.placement.homogeneous.tobytes(), placed.state.tobytes()]
+    for joint, measured in sorted(placed.measured.items()):
+        key.append(joint.encode())
+        key.append(measured.placement.homogeneous.tobytes())
+        key.append(measured.link.homogeneous.tobytes())
+    return tuple(key)

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import UnknownNameError
-from vkc_pin.utils.arguments import check_mapping, check_number
+from vkc_pin.utils.arguments import check_choice, check_mapping, check_number
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.pickling import freeze
 from vkc_pin.world.collision.solids import flatten_placements
 from vkc_pin.world.models.articulated_object import ArticulatedObject, Freedom
+from vkc_pin.world.models.grafting import round_placement
+from vkc_pin.world.models.measured_joint import MeasuredJoint, mount_joint
 from vkc_pin.world.models.shapes import (
     clamp_to_limits,
     compute_bounding_box,
@@ -37,6 +39,7 @@ class PlacedObject:
         state: Its joint values, shape (n,), [rad] or [m], in the order of
             `object.coordinates.names`.
         reversed: Attachments that are approached from the side opposite to their description.
+        measured: Joint → where it was measured, of joints that are elsewhere than described.
     """
 
     name: str
@@ -44,6 +47,7 @@ class PlacedObject:
     placement: pin.SE3
     state: Floats
     reversed: tuple[str, ...] = ()
+    measured: Mapping[str, MeasuredJoint] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         parts = [self.object.name]
@@ -100,6 +104,40 @@ class PlacedObject:
             object=dataclasses.replace(self.object, attachments=attachments),
             reversed=tuple(sorted(all_reversed)),
         )
+
+    def with_measured_joint(self, joint: str, measured: MeasuredJoint) -> PlacedObject:
+        """Return a copy with a joint where it was measured; its value and limits stay.
+
+        Raises:
+            UnknownNameError: It has no such joint.
+        """
+        index = self.find_joint(joint)
+        model = self.object.model
+        parent_link = self.get_link_shift(int(model.parents[index]))
+        own_link = self.get_link_shift(index)
+        moved = mount_joint(
+            self.object,
+            index,
+            round_placement(parent_link * measured.placement),
+            round_placement(measured.link * own_link.inverse()),
+        )
+        all_measured = freeze({**self.measured, joint: measured})
+        return dataclasses.replace(self, object=moved, measured=all_measured)
+
+    def find_joint(self, joint: str) -> int:
+        """Return the index of a joint in the object's model.
+
+        Raises:
+            UnknownNameError: It has no such joint.
+        """
+        coordinates = self.object.coordinates
+        name = check_choice(joint, coordinates.names, f"joint of {self.name}", "joint")
+        return coordinates.joints[coordinates.index(name)]
+
+    def get_link_shift(self, joint: int) -> pin.SE3:
+        """Return where a joint's own link is in its frame: identity, unless it was measured."""
+        name = str(self.object.model.names[joint])
+        return self.measured[name].link if name in self.measured else pin.SE3.Identity()
 
     def link_placement(self, link: str) -> pin.SE3:
         """Return the placement of `link` in the world frame.

@@ -44,6 +44,8 @@ from vkc_pin.world.scene.hold import (
     resolve_holds,
     warn_of_openings,
 )
+from vkc_pin.world.scene.joint_estimation import JointEstimate
+from vkc_pin.world.scene.measured_joints import place_on_estimate
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 from vkc_pin.world.scene.poses import as_placement
@@ -291,6 +293,39 @@ class Scene:
         pose = as_placement(placement, name="placement")
         moved = dataclasses.replace(placed, placement=pose)
         return self._with(objects=freeze({**self.objects, name: moved}))
+
+    def with_measured_joint(
+        self,
+        name: str,
+        joint: str,
+        estimate: JointEstimate,
+        *,
+        link: str | None = None,
+        value: float | None = None,
+    ) -> Scene:
+        """Return the scene with a joint of an object on an estimated axis.
+
+        At the value of the first pose, the link is where the estimate has it; from there it moves
+        on the estimated axis. The joint keeps its present value, its limits, and the sense in which
+        it is positive, and all that it carries moves with it.
+
+        Args:
+            name: Object, which is fixed in the world.
+            joint: Joint.
+            estimate: Its estimate from poses in the world frame; see `estimate_joint`.
+            link: Link whose poses were measured, while the other joints were as in this scene.
+                Default: the joint's own link, which it moves itself.
+            value: Value of the joint at position 0 of the estimate, which is its first pose, [rad]
+                or [m]. Default: the present one.
+
+        Raises:
+            UnknownNameError: There is no such object, joint or link.
+            InputError: The object is free, the joint does not move the link, or the estimate is of
+                another kind than the joint.
+        """
+        check_instance(estimate, JointEstimate, "estimate")
+        placed = place_on_estimate(self._find_object(name), joint, estimate, link, value)
+        return self._with(objects=freeze({**self.objects, name: placed}))
 
     def with_obstacle(self, name: str, placement: Any) -> Scene:
         """Return the scene with obstacle `name` at another placement.

@@ -20,6 +20,7 @@ from vkc_pin.world.files.documents import Document, parse_document
 from vkc_pin.world.files.resources import check_path
 from vkc_pin.world.files.srdf import format_names, read_allowed_pairs
 from vkc_pin.world.models.grafting import round_placement
+from vkc_pin.world.models.measured_joint import MeasuredJoint
 from vkc_pin.world.models.object_file import build_object, load_object
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
@@ -196,9 +197,14 @@ def _describe_hold(hold: Hold, objects: Mapping[str, PlacedObject]) -> dict[str,
         entry["at"] = list(hold.at)
     if hold.deviation:
         grasp = get_attachment(objects, hold)
-        pose = pin.SE3ToXYZQUAT(grasp.motion(hold.at).inverse())
-        entry["measured"] = {"position": pose[:3].tolist(), "quaternion": pose[3:].tolist()}
+        entry["measured"] = _describe_pose(grasp.motion(hold.at).inverse())
     return entry
+
+
+def _describe_pose(placement: pin.SE3) -> dict[str, Any]:
+    """Return a placement as plain data; see `scene_schema.PoseSchema`."""
+    pose = pin.SE3ToXYZQUAT(placement)
+    return {"position": pose[:3].tolist(), "quaternion": pose[3:].tolist()}
 
 
 def _update_object_entry(
@@ -219,6 +225,7 @@ def _update_object_entry(
     names = placed.object.coordinates.names
     entry["state"] = dict(zip(names, placed.state.tolist(), strict=True))
     entry.pop("reversed", None)
+    _update_measured_joints(entry, item, placed)
     is_in_hand = placed.object.free and is_held
     described_placement = _make_pose(item).homogeneous
     is_moved = not is_in_hand and not np.array_equal(
@@ -226,7 +233,7 @@ def _update_object_entry(
     )
     neutral = np.clip(0.0, placed.object.lower, placed.object.upper)
     described_state = {**dict(zip(names, neutral.tolist(), strict=True)), **item.state}
-    is_as_described = not is_moved and entry["state"] == described_state
+    is_as_described = not is_moved and entry["state"] == described_state and not placed.measured
     # Otherwise loading the document finds the same approaches again.
     if placed.reversed or item.reversed is not None or not is_as_described:
         entry["reversed"] = list(placed.reversed)
@@ -235,6 +242,25 @@ def _update_object_entry(
             entry.pop(orientation, None)
         entry["position"] = placed.placement.translation.tolist()
         entry["rpy"] = pin.rpy.matrixToRpy(placed.placement.rotation).tolist()
+
+
+def _update_measured_joints(
+    entry: dict[str, Any], item: schema.PlacedObjectSchema, placed: PlacedObject
+) -> None:
+    """Make the measured joints in the entry of an object those of the object as it is placed."""
+    described = entry.pop("measured")
+    joints = dict[str, Any]()
+    for joint, measured in placed.measured.items():
+        joints[joint] = {
+            "placement": _describe_pose(measured.placement),
+            "link": _describe_pose(measured.link),
+        }
+        if joint in item.measured:
+            before = _make_measured_joint(item.measured[joint])
+            if before.placement == measured.placement and before.link == measured.link:
+                joints[joint] = described[joint]
+    if joints:
+        entry["measured"] = joints
 
 
 def _load_robot(document: Document, description: schema.SceneSchema, folder: Path) -> Robot:
@@ -531,7 +557,14 @@ def _load_object(
     for number, attachment in enumerate(item.reversed or ()):
         with document.annotate_errors((*path, "reversed", number)):
             placed = placed.with_reversed(attachment)
+    for joint, one in item.measured.items():
+        with document.annotate_errors((*path, "measured", joint)):
+            placed = placed.with_measured_joint(joint, _make_measured_joint(one))
     return placed
+
+
+def _make_measured_joint(item: schema.MeasuredJointSchema) -> MeasuredJoint:
+    return MeasuredJoint(_make_pose(item.placement), _make_pose(item.link))
 
 
 def _extract_part(document: Document, path: tuple[str | int, ...]) -> Document:

@@ -191,10 +191,22 @@ ObstacleSchema = Annotated[
 ]
 
 
+class MeasuredJointSchema(Schema):
+    """A joint that was measured elsewhere than described; see `MeasuredJoint`.
+
+    `placement` is that of its frame in the frame of its parent link, `link` that of its own link in
+    its moving frame.
+    """
+
+    placement: PoseSchema
+    link: PoseSchema
+
+
 class PlacedObjectSchema(PoseSchema):
     """An articulated object: `type` is its name, file or description, `state` its joint values.
 
-    Joints that `state` leaves out are at 0. Attachments that are `reversed` are approached from the
+    Joints that `state` leaves out are at 0, joints in `measured` are elsewhere than described.
+    Attachments that are `reversed` are approached from the
     side opposite to their description; None: those whose approach would take the hand through the
     object or the floor.
     """
@@ -203,6 +215,7 @@ class PlacedObjectSchema(PoseSchema):
     type: Description
     state: Mapping[str, Number] = Field(default_factory=dict)
     reversed: tuple[str, ...] | None = None
+    measured: Mapping[str, MeasuredJointSchema] = Field(default_factory=dict)
 
 
 class SceneRobotSchema(Schema):

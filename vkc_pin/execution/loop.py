@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import coal
 import numpy as np
 
 from vkc_pin.errors import InputError, format_value
+from vkc_pin.execution.joint_observer import JointFinding, JointObserver, ObserveLink
 from vkc_pin.execution.monitor import Monitor
 from vkc_pin.execution.record import Cycle, Decision, ExecutionResult
 from vkc_pin.execution.robots import Robot, RobotState
@@ -16,8 +18,8 @@ from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner
 from vkc_pin.planning.prepare import prepare
 from vkc_pin.planning.replan import find_remaining_steps, measure_grasps, replan
-from vkc_pin.planning.stopping import brake
-from vkc_pin.utils.arguments import check_instance, check_number
+from vkc_pin.planning.stopping import brake, hold_still
+from vkc_pin.utils.arguments import check_finite_array, check_instance, check_number
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.shapes import triangulate
 from vkc_pin.world.scene.scene import Scene
@@ -33,12 +35,16 @@ _FIRST_SEARCH = 0.5  # [s] of the first search from rest
 _BRAKE_DELAY = 0.02  # [s] from the decision to brake to its begin, for sending the motion
 
 
-def execute(
+def execute(  # noqa: PLR0913 - keyword options of a public call
     plan: Plan,
     robot: Robot,
     *,
     rate: float = 20.0,
     observe: Observe | None = None,
+    observe_link: ObserveLink | None = None,
+    link_noise: tuple[float, float] = (0.001, 0.005),
+    force_limit: float | None = None,
+    torque_limit: float | None = None,
     lead: float = 0.2,
     time_limit: float | None = None,
     patience: float = 10.0,
@@ -52,12 +58,23 @@ def execute(
     motion, the rest is planned again, to begin `lead` seconds later, while the robot goes on. If no
     new motion is found in time, the robot brakes on its path, and plans from rest.
 
+    While the hand moves a joint of a fixed object, the joint is estimated from poses of the grasped
+    link. If the estimate is decisively better than what the plan assumes, the rest is planned again
+    with it, and the grasp stays as it is. A force or torque beyond its limit ends the pull: the
+    robot stops at once, and goes on if the joint is found to be elsewhere.
+
     Args:
         plan: A successful plan, in whose start the robot stands.
         robot: The robot.
         rate: Cycles per second [Hz].
         observe: Updates a scene with the present placements of objects and obstacles. Default:
             nothing changes.
+        observe_link: Returns the measured pose of a grasped link in the world now, see
+            `as_placement`, or None where it is not seen: (object, link) → pose. Default: joints
+            are as described.
+        link_noise: Standard deviations of these poses, per axis: position [m] and rotation [rad].
+        force_limit: Force between hand and grasped object at which a pull ends [N]. Default: none.
+        torque_limit: Torque at which it ends [N·m]. Default: none.
         lead: Time from a decision to the begin of the new motion, within which it must be found
             [s].
         time_limit: Wall-clock limit of planning again [s]. Default: `lead`. More makes sense for a
@@ -67,8 +84,8 @@ def execute(
         planner: Planner whose caches are used.
 
     Raises:
-        InputError: The plan is no success or ends in motion, the robot is not at its start, or an
-            argument is invalid.
+        InputError: The plan is no success or ends in motion, the robot is not at its start or does
+            not measure what is limited, or an argument is invalid.
     """
     check_instance(plan, Plan, "plan").check_success()
     if plan.ends_in_motion:
@@ -80,40 +97,95 @@ def execute(
     if observe is not None and not callable(observe):
         expected, got = "a function of a Scene", format_value(observe)
         raise InputError("cannot be called", field="observe", expected=expected, got=got)
+    observer = _make_observer(observe_link, link_noise)
+    state = robot.read()
+    force_limit = _check_load_limit(force_limit, state.grasp_force, "force")
+    torque_limit = _check_load_limit(torque_limit, state.grasp_torque, "torque")
     period = 1.0 / check_number(rate, "rate", "cycles per second", low=0.1, high=1000.0)
     lead = check_number(lead, "lead", "a time [s]", low=period)
     if time_limit is None:
         time_limit = lead
-    time_limit = check_number(time_limit, "time_limit", "a time [s]", low=0.0, strict=True)
-    patience = check_number(patience, "patience", "a time [s]", low=0.0)
-    loop = _Loop(plan, robot, period, observe, lead, time_limit, patience, tracking, planner)
-    return loop.run()
+    settings = _Settings(
+        period=period,
+        observe=observe,
+        observer=observer,
+        force_limit=force_limit,
+        torque_limit=torque_limit,
+        lead=lead,
+        time_limit=check_number(time_limit, "time_limit", "a time [s]", low=0.0, strict=True),
+        patience=check_number(patience, "patience", "a time [s]", low=0.0),
+        tracking=tracking,
+        planner=planner,
+    )
+    return _Loop(plan, robot, settings).run()
+
+
+def _make_observer(
+    observe_link: ObserveLink | None, link_noise: tuple[float, float]
+) -> JointObserver | None:
+    """Return the observer of joints, if there is one. Raises `InputError`."""
+    if observe_link is None:
+        return None
+    if not callable(observe_link):
+        expected, got = "a function of object and link", format_value(observe_link)
+        raise InputError("cannot be called", field="observe_link", expected=expected, got=got)
+    deviations = check_finite_array(link_noise, "link_noise")
+    if deviations.shape != (2,) or (deviations <= 0.0).any():
+        raise InputError(
+            "invalid noise",
+            field="link_noise",
+            expected="deviations of position [m] and rotation [rad], more than 0",
+            got=format_value(link_noise),
+        )
+    return JointObserver(observe_link, *deviations.tolist())
+
+
+def _check_load_limit(limit: float | None, measured: float | None, quantity: str) -> float:
+    """Return a limit of a grasp's load; inf: none. Raises `InputError`."""
+    if limit is None:
+        return np.inf
+    field = f"{quantity}_limit"
+    checked = check_number(limit, field, low=0.0, strict=True)
+    if measured is None:
+        raise InputError(
+            f"the robot does not measure the {quantity} of its grasp",
+            field=field,
+            expected=f"None, or states with `grasp_{quantity}`",
+            got=limit,
+        )
+    return checked
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """Arguments of `execute`.
+
+    Attributes:
+        period: Duration of a cycle [s].
+        force_limit, torque_limit: Limits of a pull [N], [N·m]; inf: none.
+    """
+
+    period: float
+    observe: Observe | None
+    observer: JointObserver | None
+    force_limit: float
+    torque_limit: float
+    lead: float
+    time_limit: float
+    patience: float
+    tracking: float
+    planner: Planner | None
 
 
 class _Loop:
     """State of an execution."""
 
-    def __init__(
-        self,
-        plan: Plan,
-        robot: Robot,
-        period: float,
-        observe: Observe | None,
-        lead: float,
-        time_limit: float,
-        patience: float,
-        tracking: float,
-        planner: Planner | None,
-    ) -> None:
+    def __init__(self, plan: Plan, robot: Robot, settings: _Settings) -> None:
         self._first = plan
         self._robot = robot
-        self._period = period
-        self._observe = observe
-        self._lead = lead
-        self._time_limit = time_limit
-        self._patience = patience
-        self._tracking = tracking
-        self._planner = planner
+        self._settings = settings
+        self._joint: JointFinding | None = None  # that the present motion does not account for
+        self._pull = ""  # why a pull ended, until the joint is found to be elsewhere
         self._cycles = list[Cycle]()
         self._sent = list[tuple[float, Plan]]()
         # While the robot brakes or stands, the steps that are left, and the motion to guess from.
@@ -124,13 +196,13 @@ class _Loop:
 
     def run(self) -> ExecutionResult:
         state = self._robot.read()
-        monitor = Monitor(self._first, tracking=self._tracking)
+        monitor = Monitor(self._first, tracking=self._settings.tracking)
         finding = monitor.check_tracking(float(self._first.trajectory.times[0]), state)
         if finding:
             expected = "a robot at the start of the plan"
             raise InputError("not at its start", field="robot", expected=expected, got=finding)
         self._rehearse()
-        begin = self._robot.time + self._period
+        begin = self._robot.time + self._settings.period
         self._robot.send(self._first.trajectory, begin)
         self._sent.append((begin, self._first))
         self._monitor = monitor
@@ -154,13 +226,13 @@ class _Loop:
             latency = time.perf_counter() - began
             self._cycles.append(Cycle(now, motion_time, latency, decision, why))
             # A robot at rest misses nothing while a motion is searched.
-            self._late += latency > self._period and decision in ("go on", "replan")
+            self._late += latency > self._settings.period and decision in ("go on", "replan")
             if decision == "stop":
                 return why
             end = float(self._plan.trajectory.times[-1])
             if self._waiting is None and self._get_motion_time(now) >= end:
                 return self._monitor.check_tracking(end, self._robot.read())
-            next_cycle = max(next_cycle + self._period, self._robot.time)
+            next_cycle = max(next_cycle + self._settings.period, self._robot.time)
 
     def _rehearse(self) -> None:
         """Plan the rest of the motion before it begins, to load and build what that takes.
@@ -169,7 +241,7 @@ class _Loop:
         """
         triangulate(coal.Box(1.0, 1.0, 1.0))  # imports what other surfaces take, too
         begin = float(self._first.trajectory.times[0])
-        replan(self._first, begin, time_limit=_REHEARSAL, planner=self._planner)
+        replan(self._first, begin, time_limit=_REHEARSAL, planner=self._settings.planner)
 
     @property
     def _plan(self) -> Plan:
@@ -183,7 +255,7 @@ class _Loop:
 
     def _send(self, plan: Plan, begin: float) -> bool:
         """Send a plan's motion; return whether it is not too late for that."""
-        monitor = Monitor(plan, tracking=self._tracking)
+        monitor = Monitor(plan, tracking=self._settings.tracking)
         if self._robot.time >= begin:
             return False
         self._robot.send(plan.trajectory, begin)
@@ -193,28 +265,43 @@ class _Loop:
 
     def _look(self, scene: Scene) -> Scene:
         """Return a scene with the present placements of objects and obstacles."""
-        return scene if self._observe is None else self._observe(scene)
+        return scene if self._settings.observe is None else self._settings.observe(scene)
+
+    def _look_ahead(self, time: float) -> Scene:
+        """Return the scene at a time of the present motion [s], with what is known now."""
+        scene = self._look(self._plan.scene_at(time))
+        return scene if self._joint is None else self._joint.update(scene)
 
     def _decide(self, now: float, state: RobotState) -> tuple[Decision, str]:
         begin, plan = self._sent[-1]
         if now - state.time > _STALE:
             self._robot.stop()
             return "stop", f"the robot's state is {now - state.time:.2g} s old"
+        if self._settings.observer is not None and now >= begin:
+            self._joint = self._settings.observer.observe(plan, self._get_motion_time(now))
+            if self._joint is not None and self._joint.is_other_kind:
+                self._robot.stop()
+                return "stop", self._joint.reason
+        overload = self._find_overload(state)
+        if overload and not self._pull:
+            return self._end_pull(now, overload)
         if self._waiting is not None:
             return self._plan_from_rest(now, self._waiting)
         if min(now, state.time) < begin:
             return "go on", ""  # a motion has been sent that has not begun
-        scene = None if self._observe is None else self._look(plan.scene)
+        scene = None if self._settings.observe is None else self._look(plan.scene)
         motion_time = self._get_motion_time(now)
         finding, touched = self._monitor.check_world(motion_time, scene)
+        if self._joint is not None and not finding:
+            finding = self._joint.reason
         if np.isfinite(touched):
             stop = self._make_stop(motion_time)
-            if touched - motion_time < self._lead + float(stop.times[-1]):
+            if touched - motion_time < self._settings.lead + float(stop.times[-1]):
                 return self._brake(finding)  # there is no time to look for another motion
         error = None
-        if not finding:
+        if not finding or self._joint is not None:
             measured = self._get_motion_time(state.time)
-            finding = self._monitor.check_tracking(measured, state)
+            finding = finding or self._monitor.check_tracking(measured, state)
             planned = plan.trajectory.at(measured)[: plan.trajectory.robot_size]
             error = state.positions - planned
         if not finding:
@@ -230,22 +317,22 @@ class _Loop:
             error: Distance of the robot from its motion, shape (n,), if that is why.
         """
         plan = self._plan
-        takeover = self._get_motion_time(now) + self._lead
+        takeover = self._get_motion_time(now) + self._settings.lead
         if takeover < float(plan.trajectory.times[-1]):
             try:
-                scene = self._look(plan.scene_at(takeover))
+                scene = self._look_ahead(takeover)
                 state = None if error is None else scene.start + error
                 found = replan(
                     plan,
                     takeover,
                     state=state,
                     scene=scene,
-                    time_limit=self._time_limit,
-                    planner=self._planner,
+                    time_limit=self._settings.time_limit,
+                    planner=self._settings.planner,
                 )
             except InputError as impossible:  # the steps are, there
                 return self._brake(f"{finding}; {impossible}")
-            if found.success and self._send(found, now + self._lead):
+            if found.success and self._send(found, now + self._settings.lead):
                 return "replan", finding
             finding = f"{finding}; {'too late' if found.success else found.status}"
         return self._brake(finding)
@@ -281,6 +368,40 @@ class _Loop:
         self._attempts = 0
         return "brake", reason
 
+    def _find_overload(self, state: RobotState) -> str:
+        """Return how a limit of force or torque is exceeded; "" if none is."""
+        force, torque = state.grasp_force or 0.0, state.grasp_torque or 0.0
+        if force > self._settings.force_limit:
+            return f"pulls against the mechanism with {force:.0f} N"
+        if torque > self._settings.torque_limit:
+            return f"pulls against the mechanism with {torque:.0f} N·m"
+        return ""
+
+    def _end_pull(self, now: float, reason: str) -> tuple[Decision, str]:
+        """Stop at once, and wait until the joint is known.
+
+        To brake on the path would be to pull on. The robot's own stop takes no longer than that.
+        """
+        if now < self._sent[-1][0] and len(self._sent) > 1:
+            self._sent.pop()  # a motion that has not begun, and never will
+        plan = self._plan
+        motion_time = self._get_motion_time(now)
+        braking = self._make_stop(motion_time)
+        self._robot.stop()
+        if self._waiting is None:
+            try:
+                steps = find_remaining_steps(plan, motion_time)
+            except InputError:
+                return "stop", reason
+            self._waiting = (steps, plan.trajectory)
+        motion = hold_still(plan.trajectory, motion_time)
+        stop = plan.check_stop(motion, plan.scene_at(motion_time))
+        self._sent.append((self._robot.time, stop))
+        self._rest_since = self._robot.time + float(braking.times[-1])
+        self._attempts = 0
+        self._pull = reason
+        return "brake", reason
+
     def _plan_from_rest(
         self, now: float, waiting: tuple[tuple[Step, ...], Trajectory]
     ) -> tuple[Decision, str]:
@@ -288,30 +409,37 @@ class _Loop:
         if now < self._rest_since:
             return "wait", "braking"
         steps, guess = waiting
-        if now > self._rest_since + self._patience:
-            return "stop", "no motion was found from rest"
+        if now > self._rest_since + self._settings.patience:
+            return "stop", self._pull or "no motion was found from rest"
+        if self._pull and self._joint is None:
+            return "wait", self._pull
         end = float(self._plan.trajectory.times[-1])
         try:
-            scene = measure_grasps(self._look(self._plan.scene_at(end)))
+            scene = self._look_ahead(end)
+            if self._pull:
+                positions = self._robot.read().positions
+                scene = scene.with_start(base=positions[:3], arm=positions[3:], velocity={})
+            scene = measure_grasps(scene)
             prepared = prepare(
                 scene,
                 steps,
                 options=self._first.options,
                 terms=self._first.terms,
-                planner=self._planner,
+                planner=self._settings.planner,
             )
         except InputError as impossible:
             return "wait", str(impossible)
         # Each search is longer than the one before, with other random numbers.
-        first = max(self._time_limit, _FIRST_SEARCH)
-        limit = min(first * 2.0**self._attempts, max(self._patience, first))
+        first = max(self._settings.time_limit, _FIRST_SEARCH)
+        limit = min(first * 2.0**self._attempts, max(self._settings.patience, first))
         found = prepared.solve(
             guess=guess, time_limit=limit, seed=self._first.seed + self._attempts, explain=False
         )
         self._attempts += 1
         if not found.success:
             return "wait", found.status
-        if not self._send(found, self._robot.time + self._period):
+        if not self._send(found, self._robot.time + self._settings.period):
             return "wait", "too late"
         self._waiting = None
+        self._pull = ""
         return "replan", "from rest"

@@ -29,8 +29,10 @@ from vkc_pin.simulation.physics import import_mujoco
 from vkc_pin.simulation.robot import SimulatedRobot
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.validate import validate
+from vkc_pin.world.scene.joint_estimation import JointEstimate
+from vkc_pin.world.scene.measured_joints import find_axis
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.steps import Actuate, Place
+from vkc_pin.world.task.steps import Actuate, Place, Step
 
 TASKS = (
     "door",
@@ -49,9 +51,13 @@ ROWS: Mapping[str, str] = {
     "person": "a person crosses the path of the base at 0.5 to 1 m/s, and is given 0.3 m of room",
     "localisation": "the base is localised 20 mm and 1° off, and drifts by 5 mm/m and 0.2°/m",
     "grasp": "the hand closes up to 8 mm and 3° off, which is noticed then",
+    "axis": "the hinge's axis or slide's direction is up to 30 mm and 5° elsewhere, the handle is "
+    "not; a camera sees the grasped link with 1 mm and 0.3° of noise",
 }
 """Name of a row of the table → what differs from the plan."""
 
+_JOINTLESS = ("household_cup",)
+"""Tasks without a joint, to which the row "axis" does not apply."""
 _PERSON = "person"
 _WIDTH = 0.2  # [m], radius of a person and of what appears
 # [m], radius of the room that a person may need before the robot has come to rest: 0.5 s at 0.6 m/s
@@ -66,6 +72,12 @@ _FEW = 200_000  # evaluations for a motion round it
 _MOVING = 0.02  # [m/s] or [rad/s]; slower, a robot stands, and who walks into it does so himself
 _REACHED = {"m": 0.01, "rad": 0.02}  # accepted miss of a goal, as in `execution`
 _DEEPEST = 1e-3  # [m] of collisions that count as none
+_AXIS_SHIFT = 0.03  # [m]
+_AXIS_TURN = np.radians(5.0)
+_LINK_NOISE = (0.001, float(np.radians(0.3)))  # of a camera: position [m] and rotation [rad]
+# Limits of a pull: a third of what breaks a grasp, and three times what an undisturbed one takes
+_FORCE_LIMIT = 93.0  # [N]
+_TORQUE_LIMIT = 10.0  # [N·m]
 
 
 Observation = Callable[[Scene, float, Floats, float], Scene]
@@ -123,11 +135,18 @@ def run(
     }
     specs = []
     for row, name, number in itertools.product(kinds, names, range(trials)):
+        if not _applies(row, name):
+            continue
         key = f"{list(ROWS).index(row)}/{TASKS.index(name)}/{number:04d}"
         specs.append({"key": key, "row": row, "task": name, "number": number, "seed": seed})
     return runner.run(
         specs, _record, out, settings=settings, format_results=format_results, **execution
     )
+
+
+def _applies(row: str, task: str) -> bool:
+    """Return whether a row of the table has trials of a task."""
+    return row != "axis" or task not in _JOINTLESS
 
 
 def format_results(result: Mapping[str, Any]) -> str:
@@ -137,7 +156,10 @@ def format_results(result: Mapping[str, Any]) -> str:
     head = ["row", "task", "plans", "open", "closed", "deepest [mm]", "latency [ms]", "cycles [%]"]
     rows = []
     for row, name in itertools.product(about["rows"], about["tasks"]):
-        rows.append([row, name, *_summarize(select(records, row=row, task=name))])
+        cells = ["does not apply: no joint", *("–" for _ in head[3:])]
+        if _applies(row, name):
+            cells = _summarize(select(records, row=row, task=name))
+        rows.append([row, name, *cells])
     for row in about["rows"]:
         rows.append([row, "all", *_summarize(select(records, row=row))])
     lines = ["## Trials that failed in the closed loop", ""]
@@ -202,7 +224,15 @@ def _record(spec: dict[str, Any]) -> dict[str, Any]:
         travelled = float(np.linalg.norm(np.diff(base, axis=0), axis=1).sum())
         return disturbance.observe(scene, robot.time, robot.read().positions, travelled)
 
-    result = execute(found, robot, observe=observe)
+    options: dict[str, Any] = {}
+    if row == "axis":
+        options = {
+            "observe_link": _make_camera(robot, np.random.default_rng([seed, spec["number"]])),
+            "link_noise": _LINK_NOISE,
+            "force_limit": _FORCE_LIMIT,
+            "torque_limit": _TORQUE_LIMIT,
+        }
+    result = execute(found, robot, observe=observe, **options)
     robot.wait(robot.time + 1.0)
     fields |= _judge("closed", found, robot, disturbance, result)
     fields |= {
@@ -266,6 +296,8 @@ def _disturb(row: str, found: Plan, rng: np.random.Generator) -> Disturbance:
         offset = (0.02 * np.cos(angle), 0.02 * np.sin(angle), np.radians(1.0) * signs[0])
         drift = (0.005 * np.cos(angle), 0.005 * np.sin(angle), np.radians(0.2) * signs[1])
         return _mislocalise(found, name, offset, drift, at_grasp)
+    if row == "axis":
+        return Disturbance(_choose_axis(scene, step, rng), lambda known, *_: known)
     if row == "nothing":
         return Disturbance(scene, lambda known, *_: known)
     return _obstruct(row, found, closing, rng)
@@ -290,6 +322,67 @@ def _displace(
     rotation = pin.utils.rotate("z", angle)
     position = about + rotation @ (at.translation - about) + shift
     return scene.with_placement(name, pin.SE3(rotation @ at.rotation, position))
+
+
+def _choose_axis(scene: Scene, step: Step, rng: np.random.Generator) -> Scene:
+    """Return a scene in which a joint has another axis, and the step can be carried out.
+
+    About most axes that are not vertical, a door cannot open far: its leaf meets the wall.
+    """
+    for _ in range(_DRAWS):
+        actual = _displace_axis(scene, step, rng)
+        if plan(actual, [step], max_evaluations=_FEW).success:
+            return actual
+    return scene
+
+
+def _displace_axis(scene: Scene, step: Step, rng: np.random.Generator) -> Scene:
+    """Return a scene in which the joint that a step moves has another axis.
+
+    The axis is turned and displaced at the height of the handle. The grasped link is where it was.
+    """
+    assert isinstance(step, Actuate)
+    placed = scene.objects[step.object]
+    (joint,) = step.joints
+    attachment = placed.object.attachment(step.attachment)
+    link = placed.link_placement(attachment.link)
+    handle = (link * attachment.placement).translation
+    kind, axis, point = find_axis(placed, joint)
+    foot = point + axis * (axis @ (handle - point))
+    across = np.linalg.svd(axis[None])[2][1:]
+    turn = rng.uniform(0.0, _AXIS_TURN) * _draw_direction(rng) @ across
+    shift = rng.uniform(0.0, _AXIS_SHIFT) * _draw_direction(rng) @ across
+    actual = JointEstimate(
+        kind=kind,
+        axis=pin.exp3(turn) @ axis,
+        point=foot + shift,
+        link=link,
+        positions=np.zeros(1),
+        axis_deviation=0.0,
+        point_deviation=0.0,
+        information={},
+    )
+    return scene.with_measured_joint(step.object, joint, actual, link=attachment.link)
+
+
+def _draw_direction(rng: np.random.Generator) -> Floats:
+    """Return a random unit vector in the plane, shape (2,)."""
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    return np.array([np.cos(angle), np.sin(angle)])
+
+
+def _make_camera(
+    robot: SimulatedRobot, rng: np.random.Generator
+) -> Callable[[str, str], pin.SE3 | None]:
+    """Return a function that measures where a link of an object is: (object, link) → pose."""
+
+    def see(name: str, link: str) -> pin.SE3:
+        pose = robot.locate(name, link)
+        turn = pin.exp3(rng.normal(0.0, _LINK_NOISE[1], 3))
+        position = pose.translation + rng.normal(0.0, _LINK_NOISE[0], 3)
+        return pin.SE3(pose.rotation @ turn, position)
+
+    return see
 
 
 def _mislocalise(
@@ -389,7 +482,7 @@ def _judge(
     if result is not None and not result.success:
         reasons.append(result.reason)
     reasons += _find_misses(found, robot)
-    reasons += [f"{grip.what} was lost" for grip in robot.grips if grip.missed]
+    reasons += [grip.problem for grip in robot.grips if grip.problem]
     depth = 0.0
     contacts = robot.contacts(disturbance.actual)
     depth = max([depth, *(contact.depth for contact in contacts)])
@@ -402,6 +495,7 @@ def _judge(
         f"{loop}_reason": "; ".join(reasons),
         f"{loop}_depth": depth,
         f"{loop}_force": max((grip.force for grip in robot.grips), default=0.0),
+        f"{loop}_torque": max((grip.torque for grip in robot.grips), default=0.0),
     }
 
 

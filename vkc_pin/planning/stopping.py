@@ -70,6 +70,11 @@ def brake(scene: Scene, motion: Trajectory, time: float, options: Options) -> Tr
     return _run_through(motion, np.array(clocks), np.sqrt(squares))
 
 
+def hold_still(motion: Trajectory, time: float) -> Trajectory:
+    """Return a motion that stays where another one is at a time [s], with its holds then."""
+    return _run_through(motion, np.array([time]), np.zeros(1))
+
+
 def _choose_places(motion: Trajectory, time: float) -> Floats:
     """Return times of a motion from `time` to its end, with all its knots among them."""
     end = float(motion.times[-1])

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from vkc_pin.errors import InputError, format_value
@@ -61,11 +62,14 @@ class _Sample:
         number: Number of the time step at which it is taken.
         positions: Positions of base and arm, shape (n,), [m] and [rad].
         velocities: Their velocities, shape (n,), [m/s] and [rad/s].
+        force, torque: Largest load on a grasp, as `GraspForce` has it, [N] and [N·m].
     """
 
     number: int
     positions: Floats
     velocities: Floats
+    force: float
+    torque: float
 
 
 class SimulatedRobot:
@@ -183,6 +187,8 @@ class SimulatedRobot:
                 sample.number * self._physics.timestep,
                 sample.positions + self._noise * errors[0],
                 sample.velocities + self._velocity_noise * errors[1],
+                sample.force,
+                sample.torque,
             )
 
     def send(self, motion: Trajectory, begin: float) -> None:
@@ -242,6 +248,18 @@ class SimulatedRobot:
     def grasped_poses(self) -> tuple[GraspedPose, ...]:
         """Poses of hand and grasped link as they really are, each 10 ms."""
         return self._recording.list_grasped_poses()
+
+    def locate(self, name: str, link: str) -> pin.SE3:
+        """Return where a link of an object really is now, in the world.
+
+        Raises:
+            UnknownNameError: There is no such object or link.
+        """
+        objects = self._tree.scene.objects
+        check_choice(name, objects, "object", "name")
+        objects[name].object.link_frame(link)  # raises an error if there is no such link
+        stepper = self._stepper
+        return stepper.physical.place_frame(stepper.data, f"{name}.{link}")
 
     @property
     def grasp_forces(self) -> tuple[GraspForce, ...]:
@@ -453,7 +471,11 @@ class SimulatedRobot:
     def _measure(self) -> None:
         """Measure the present state."""
         velocities = self._stepper.velocities[: self._size]
-        self._samples.append(_Sample(self._number, self._measured_positions(), velocities))
+        loads = self._stepper.grips.loads.values()
+        force = max((force for force, _ in loads), default=0.0)
+        torque = max((torque for _, torque in loads), default=0.0)
+        positions = self._measured_positions()
+        self._samples.append(_Sample(self._number, positions, velocities, force, torque))
 
 
 def _check_deviations(value: ArrayLike, size: int, field: str) -> Floats:

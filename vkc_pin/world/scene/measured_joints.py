@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import check_number
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.measured_joint import MeasuredJoint, compute_axis
-from vkc_pin.world.scene.joint_estimation import JointEstimate
+from vkc_pin.world.scene.joint_estimation import JointEstimate, JointKind
 from vkc_pin.world.scene.placed_object import PlacedObject
 
 
@@ -28,14 +28,14 @@ def place_on_estimate(
     """
     index = placed.find_joint(joint)
     item = placed.object
-    coordinate = item.coordinates.index(joint)
     _check_kind(placed, joint, estimate)
     state = placed.state.copy()
     if value is not None:
-        state[coordinate] = check_number(value, "value")
+        state[item.coordinates.index(joint)] = check_number(value, "value")
     data = item.model.createData()
     pin.forwardKinematics(item.model, data, item.coordinates.q(state))
-    parent = placed.placement * data.oMi[item.model.parents[index]]
+    parent_index = int(item.model.parents[index])
+    parent = placed.placement * data.oMi[parent_index]
     body = placed.placement * data.oMi[index]
     motion = (parent * item.model.jointPlacements[index]).actInv(body)
     if link is None:
@@ -45,18 +45,33 @@ def place_on_estimate(
 
     displaced = measured_body * motion.inverse()
     axis = displaced.rotation @ compute_axis(item.model, index)
-    # A line has two directions. The description has the sense of the joint.
-    target = estimate.axis if estimate.axis @ axis >= 0.0 else -estimate.axis
+    target = estimate.align(axis).axis
     turn = pin.Quaternion.FromTwoVectors(axis, target).matrix()
     origin = displaced.translation
     if estimate.kind == "revolute":
         origin = estimate.point + target * (target @ (origin - estimate.point))
     new = pin.SE3(turn @ displaced.rotation, origin)
 
-    parent_link = parent * placed.get_link_shift(int(item.model.parents[index]))
+    parent_link = parent * placed.get_link_shift(parent_index)
     own_link = measured_body * placed.get_link_shift(index)
     measured = MeasuredJoint(parent_link.actInv(new), (new * motion).actInv(own_link))
     return placed.with_measured_joint(joint, measured)
+
+
+def find_axis(placed: PlacedObject, joint: str) -> tuple[JointKind, Floats, Floats]:
+    """Return kind, direction and a point of a joint's axis in the world, shape (3,) each.
+
+    Raises:
+        UnknownNameError: The object has no such joint.
+    """
+    index = placed.find_joint(joint)
+    item = placed.object
+    slides = item.coordinates.units[item.coordinates.index(joint)] == "m"
+    data = item.model.createData()
+    pin.forwardKinematics(item.model, data, item.coordinates.q(placed.state))
+    frame = placed.placement * data.oMi[index]
+    kind: JointKind = "prismatic" if slides else "revolute"
+    return kind, frame.rotation @ compute_axis(item.model, index), frame.translation
 
 
 def _check_kind(placed: PlacedObject, joint: str, estimate: JointEstimate) -> None:
@@ -68,9 +83,7 @@ def _check_kind(placed: PlacedObject, joint: str, estimate: JointEstimate) -> No
             expected="an object that is not free",
             got=placed.name,
         )
-    coordinate = placed.object.coordinates.index(joint)
-    slides = placed.object.coordinates.units[coordinate] == "m"
-    kind = "prismatic" if slides else "revolute"
+    kind, _, _ = find_axis(placed, joint)
     if estimate.kind != kind:
         raise InputError(
             "an estimate of another kind of joint",

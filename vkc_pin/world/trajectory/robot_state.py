@@ -15,8 +15,12 @@ class RobotState:
         time: When it was measured, on the robot's clock [s].
         positions: Coordinates of the robot, shape (n,), [m] and [rad].
         velocities: Their velocities, shape (n,), [m/s] and [rad/s].
+        grasp_force: Force between hand and grasped object [N]; None: it is not measured.
+        grasp_torque: Torque between them at the tool frame [N·m]; None: it is not measured.
     """
 
     time: float
     positions: Floats
     velocities: Floats
+    grasp_force: float | None = None
+    grasp_torque: float | None = None

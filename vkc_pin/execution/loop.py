@@ -18,7 +18,7 @@ from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner
 from vkc_pin.planning.prepare import prepare
 from vkc_pin.planning.replan import find_remaining_steps, measure_grasps, replan
-from vkc_pin.planning.stopping import brake, hold_still
+from vkc_pin.planning.stopping import brake
 from vkc_pin.utils.arguments import check_finite_array, check_instance, check_number
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.shapes import triangulate
@@ -185,7 +185,9 @@ class _Loop:
         self._robot = robot
         self._settings = settings
         self._joint: JointFinding | None = None  # that the present motion does not account for
-        self._pull = ""  # why a pull ended, until the joint is found to be elsewhere
+        self._pull = ""  # why a pull ended, until there is a motion to go on
+        self._is_released = False  # whether the robot rests where the mechanism has it
+        self._pulled_to: Floats | None = None  # configuration at the end of the last pull
         self._cycles = list[Cycle]()
         self._sent = list[tuple[float, Plan]]()
         # While the robot brakes or stands, the steps that are left, and the motion to guess from.
@@ -267,11 +269,6 @@ class _Loop:
         """Return a scene with the present placements of objects and obstacles."""
         return scene if self._settings.observe is None else self._settings.observe(scene)
 
-    def _look_ahead(self, time: float) -> Scene:
-        """Return the scene at a time of the present motion [s], with what is known now."""
-        scene = self._look(self._plan.scene_at(time))
-        return scene if self._joint is None else self._joint.update(scene)
-
     def _decide(self, now: float, state: RobotState) -> tuple[Decision, str]:
         begin, plan = self._sent[-1]
         if now - state.time > _STALE:
@@ -282,9 +279,9 @@ class _Loop:
             if self._joint is not None and self._joint.is_other_kind:
                 self._robot.stop()
                 return "stop", self._joint.reason
-        overload = self._find_overload(state)
-        if overload and not self._pull:
-            return self._end_pull(now, overload)
+        overload = self._find_overload(state) if now >= begin else ""
+        if not self._pull and (overload or self._joint is not None):
+            return self._end_pull(overload if self._joint is None else self._joint.reason)
         if self._waiting is not None:
             return self._plan_from_rest(now, self._waiting)
         if min(now, state.time) < begin:
@@ -292,16 +289,14 @@ class _Loop:
         scene = None if self._settings.observe is None else self._look(plan.scene)
         motion_time = self._get_motion_time(now)
         finding, touched = self._monitor.check_world(motion_time, scene)
-        if self._joint is not None and not finding:
-            finding = self._joint.reason
         if np.isfinite(touched):
             stop = self._make_stop(motion_time)
             if touched - motion_time < self._settings.lead + float(stop.times[-1]):
                 return self._brake(finding)  # there is no time to look for another motion
         error = None
-        if not finding or self._joint is not None:
+        if not finding:
             measured = self._get_motion_time(state.time)
-            finding = finding or self._monitor.check_tracking(measured, state)
+            finding = self._monitor.check_tracking(measured, state)
             planned = plan.trajectory.at(measured)[: plan.trajectory.robot_size]
             error = state.positions - planned
         if not finding:
@@ -320,7 +315,7 @@ class _Loop:
         takeover = self._get_motion_time(now) + self._settings.lead
         if takeover < float(plan.trajectory.times[-1]):
             try:
-                scene = self._look_ahead(takeover)
+                scene = self._look(plan.scene_at(takeover))
                 state = None if error is None else scene.start + error
                 found = replan(
                     plan,
@@ -377,29 +372,42 @@ class _Loop:
             return f"pulls against the mechanism with {torque:.0f} N·m"
         return ""
 
-    def _end_pull(self, now: float, reason: str) -> tuple[Decision, str]:
-        """Stop at once, and wait until the joint is known.
+    def _end_pull(self, reason: str) -> tuple[Decision, str]:
+        """Brake where the robot really goes, and wait for the joint.
 
-        To brake on the path would be to pull on. The robot's own stop takes no longer than that.
+        To brake on the path would be to pull on.
         """
-        if now < self._sent[-1][0] and len(self._sent) > 1:
+        if self._robot.time < self._sent[-1][0] and len(self._sent) > 1:
             self._sent.pop()  # a motion that has not begun, and never will
         plan = self._plan
-        motion_time = self._get_motion_time(now)
-        braking = self._make_stop(motion_time)
-        self._robot.stop()
+        state = self._robot.read()
+        measured = self._get_motion_time(state.time)
+        size = plan.trajectory.robot_size
+        error = state.positions - plan.trajectory.at(measured)[:size]
+        error_rate = state.velocities - plan.trajectory.velocity(measured)[:size]
+        begin = self._robot.time + _BRAKE_DELAY
+        motion_time = self._get_motion_time(begin)
+        motion = brake(
+            plan.scene,
+            plan.trajectory,
+            motion_time,
+            plan.options,
+            error=error + error_rate * (motion_time - measured),
+            error_rate=error_rate,
+        )
+        self._robot.send(motion, begin)
         if self._waiting is None:
             try:
                 steps = find_remaining_steps(plan, motion_time)
             except InputError:
                 return "stop", reason
             self._waiting = (steps, plan.trajectory)
-        motion = hold_still(plan.trajectory, motion_time)
-        stop = plan.check_stop(motion, plan.scene_at(motion_time))
-        self._sent.append((self._robot.time, stop))
-        self._rest_since = self._robot.time + float(braking.times[-1])
+        stop = plan.check_stop(motion, self._look(plan.scene_at(motion_time)))
+        self._sent.append((begin, stop))
+        self._rest_since = begin + float(motion.times[-1])
         self._attempts = 0
         self._pull = reason
+        self._is_released = False
         return "brake", reason
 
     def _plan_from_rest(
@@ -411,14 +419,21 @@ class _Loop:
         steps, guess = waiting
         if now > self._rest_since + self._settings.patience:
             return "stop", self._pull or "no motion was found from rest"
-        if self._pull and self._joint is None:
+        if self._pull and not self._is_released:
+            self._robot.stop()  # commands that are off the mechanism pull at rest, too
+            self._is_released = True
             return "wait", self._pull
+        if self._pull and self._joint is None and not self._has_advanced():
+            decision: Decision = "stop" if self._settings.observer is None else "wait"
+            return decision, self._pull
         end = float(self._plan.trajectory.times[-1])
         try:
-            scene = self._look_ahead(end)
+            scene = self._look(self._plan.scene_at(end))
+            if self._joint is not None:
+                scene = self._joint.update(scene)
             if self._pull:
                 positions = self._robot.read().positions
-                scene = scene.with_start(base=positions[:3], arm=positions[3:], velocity={})
+                scene = scene.with_start(base=positions[:3], arm=positions[3:])
             scene = measure_grasps(scene)
             prepared = prepare(
                 scene,
@@ -441,5 +456,17 @@ class _Loop:
         if not self._send(found, self._robot.time + self._settings.period):
             return "wait", "too late"
         self._waiting = None
-        self._pull = ""
+        if self._pull:
+            self._pull = ""
+            self._pulled_to = found.scene.start
         return "replan", "from rest"
+
+    def _has_advanced(self) -> bool:
+        """Return whether the mechanism has given way since the pull before.
+
+        Then what is left of the joint's error is too small to be known, and only adds up.
+        """
+        if self._settings.observer is None or self._pulled_to is None:
+            return False
+        moved = np.abs(self._robot.read().positions - self._pulled_to)
+        return bool(moved.max() > self._settings.tracking)

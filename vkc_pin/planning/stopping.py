@@ -24,7 +24,15 @@ _SLOW = 1e-9  # [m/s] or [rad/s] below which a coordinate does not bound the bra
 _REST = 2e-3  # [s], duration of a stop of a motion that rests already
 
 
-def brake(scene: Scene, motion: Trajectory, time: float, options: Options) -> Trajectory:
+def brake(
+    scene: Scene,
+    motion: Trajectory,
+    time: float,
+    options: Options,
+    *,
+    error: Floats | None = None,
+    error_rate: Floats | None = None,
+) -> Trajectory:
     """Return a motion along a path that comes to rest as soon as possible.
 
     The motion q(τ) is run through by a clock τ(t) whose rate r = dτ/dt falls from 1 to 0:
@@ -35,11 +43,17 @@ def brake(scene: Scene, motion: Trajectory, time: float, options: Options) -> Tr
     its acceleration limit at either. As the motion keeps its limits at r = 1, u = 0 does at every
     r ≤ 1, so that there always is one.
 
+    A robot whose hand is guided by something is off the path: by e = `error` at first, which grows
+    with e' = `error_rate`. It is braked on q(τ) + e + e' (τ - `time`), which is where it really goes,
+    up to terms of second order.
+
     Args:
         scene: Scene of the motion.
         motion: Smooth motion within the limits.
         time: Time at which braking begins [s].
         options: Options of planning.
+        error: Distance of the robot from the path then, shape (n,), [m] and [rad]; None: zero.
+        error_rate: Its rate, shape (n,), [m/s] and [rad/s]; None: zero.
 
     Returns:
         The motion from `time` on, which counts from 0.
@@ -67,12 +81,13 @@ def brake(scene: Scene, motion: Trajectory, time: float, options: Options) -> Tr
             break
         clocks.append(float(places[k + 1]))
         squares.append(next_square)
-    return _run_through(motion, np.array(clocks), np.sqrt(squares))
-
-
-def hold_still(motion: Trajectory, time: float) -> Trajectory:
-    """Return a motion that stays where another one is at a time [s], with its holds then."""
-    return _run_through(motion, np.array([time]), np.zeros(1))
+    offset = np.zeros(len(motion.names))
+    slope = np.zeros(len(motion.names))
+    if error is not None:
+        offset[: motion.robot_size] = error
+    if error_rate is not None:
+        slope[: motion.robot_size] = error_rate
+    return _run_through(motion, np.array(clocks), np.sqrt(squares), offset, slope)
 
 
 def _choose_places(motion: Trajectory, time: float) -> Floats:
@@ -106,8 +121,13 @@ def _find_least(factors: Floats, offsets: Floats, limits: Floats) -> float:
     return float(min(lowest.max(initial=-np.inf), 0.0))
 
 
-def _run_through(motion: Trajectory, clocks: Floats, rates: Floats) -> Trajectory:
-    """Return a motion that has the given clocks τ and rates r at its knots."""
+def _run_through(
+    motion: Trajectory, clocks: Floats, rates: Floats, offset: Floats, slope: Floats
+) -> Trajectory:
+    """Return a motion that has the given clocks τ and rates r at its knots.
+
+    It is displaced by an offset that grows with the slope from the first clock on, shape (n,).
+    """
     is_resting = len(clocks) == 1 or not motion.velocity(clocks[0]).any()
     if is_resting:
         clocks = np.repeat(clocks[:1], 2)
@@ -116,8 +136,9 @@ def _run_through(motion: Trajectory, clocks: Floats, rates: Floats) -> Trajector
     else:
         durations = 2.0 * np.diff(clocks) / (rates[1:] + rates[:-1])
     times = np.concatenate([[0.0], np.cumsum(durations)])
-    positions = motion.at(clocks)
-    curve = Curve(times, positions, rates[:, None] * motion.velocity(clocks))
+    positions = motion.at(clocks) + offset + (clocks - clocks[0])[:, None] * slope
+    velocities = rates[:, None] * (motion.velocity(clocks) + slope)
+    curve = Curve(times, positions, velocities)
     spans = _split_into_phases(motion, clocks)
     return Trajectory(motion.names, times, positions, spans, motion.robot_size, curve)
 

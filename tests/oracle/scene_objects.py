@@ -216,6 +216,8 @@ def load_object(item: Mapping[str, Any], folder: Path) -> SceneObject:
         if is_inline
         else read_urdf(folder / description["urdf"])
     )
+    for joint, measured in (item.get("measured") or {}).items():
+        urdf = _displace_joint(urdf, joint, measured)
     joints = [joint for joint in urdf.joints if urdf.is_movable(joint)]
     limits, neutral = {}, {}
     for joint in joints:
@@ -244,6 +246,27 @@ def load_object(item: Mapping[str, Any], folder: Path) -> SceneObject:
         },
         mass=description.get("mass"),
     )
+
+
+def _displace_joint(urdf: Urdf, joint: str, measured: Mapping[str, Any]) -> Urdf:
+    """Return a URDF with a joint elsewhere: a fixed joint behind it carries its link."""
+    root = ElementTree.fromstring(urdf.text)
+    (moved,) = [one for one in root.findall("joint") if one.get("name") == joint]
+    child = moved.find("child")
+    assert child is not None
+    link, between = child.get("link", ""), f"{joint} moves"
+    ElementTree.SubElement(root, "link", name=between)
+    fixed = ElementTree.SubElement(root, "joint", name=f"{joint} carries", type="fixed")
+    ElementTree.SubElement(fixed, "parent", link=between)
+    ElementTree.SubElement(fixed, "child", link=link)
+    child.set("link", between)
+    for element, pose in ((moved, measured["placement"]), (fixed, measured["link"])):
+        for origin in element.findall("origin"):
+            element.remove(origin)
+        angles = pin.rpy.matrixToRpy(read_orientation(pose))
+        xyz, rpy = (" ".join(map(repr, map(float, row))) for row in (pose["position"], angles))
+        ElementTree.SubElement(element, "origin", xyz=xyz, rpy=rpy)
+    return Urdf(urdf.path, ElementTree.tostring(root, encoding="unicode"))
 
 
 def _read_resistance(urdf: Urdf, joint: str, settings: Mapping[str, Any]) -> dict[str, float]:

@@ -456,6 +456,7 @@ class _Loop:
         if not self._send(found, self._robot.time + self._settings.period):
             return "wait", "too late"
         self._waiting = None
+        self._joint = None  # the new motion accounts for it
         if self._pull:
             self._pull = ""
             self._pulled_to = found.scene.start

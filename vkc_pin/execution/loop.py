@@ -281,7 +281,8 @@ class _Loop:
                 return "stop", self._joint.reason
         overload = self._find_overload(state) if now >= begin else ""
         if not self._pull and (overload or self._joint is not None):
-            return self._end_pull(overload if self._joint is None else self._joint.reason)
+            why = overload if self._joint is None else self._joint.reason
+            return self._brake(why, pulls=True)
         if self._waiting is not None:
             return self._plan_from_rest(now, self._waiting)
         if min(now, state.time) < begin:
@@ -337,64 +338,42 @@ class _Loop:
         plan = self._plan
         return brake(plan.scene, plan.trajectory, motion_time, plan.options)
 
-    def _brake(self, reason: str) -> tuple[Decision, str]:
+    def _brake(self, reason: str, *, pulls: bool = False) -> tuple[Decision, str]:
         """Send a braking motion on the path.
 
         Whatever will be touched, nothing is better than to brake: it is sent unchecked.
+
+        Args:
+            reason: Why.
+            pulls: Whether the hand pulls against the mechanism that it holds. To brake on the path
+                would be to pull on: the robot brakes where it really goes.
         """
+        if pulls and self._robot.time < self._sent[-1][0] and len(self._sent) > 1:
+            self._sent.pop()  # a motion that has not begun, and never will
         plan = self._plan
+        error = np.zeros(plan.trajectory.robot_size)
+        error_rate = np.zeros(plan.trajectory.robot_size)
+        measured = 0.0
+        if pulls:
+            state = self._robot.read()
+            measured = self._get_motion_time(state.time)
+            error = state.positions - plan.trajectory.at(measured)[: len(error)]
+            error_rate = state.velocities - plan.trajectory.velocity(measured)[: len(error)]
         delay = _BRAKE_DELAY
         while True:
             begin = self._robot.time + delay
             motion_time = self._get_motion_time(begin)
-            motion = self._make_stop(motion_time)
+            motion = brake(
+                plan.scene,
+                plan.trajectory,
+                motion_time,
+                plan.options,
+                error=error + error_rate * (motion_time - measured),
+                error_rate=error_rate,
+            )
             if self._robot.time < begin:
                 break
             delay *= 2.0  # on a slow machine
-        self._robot.send(motion, begin)
-        try:
-            steps = find_remaining_steps(plan, motion_time)
-        except InputError:
-            return "stop", reason
-        self._waiting = (steps, plan.trajectory)
-        stop = plan.check_stop(motion, self._look(plan.scene_at(motion_time)))
-        self._sent.append((begin, stop))
-        self._rest_since = begin + float(motion.times[-1])
-        self._attempts = 0
-        return "brake", reason
-
-    def _find_overload(self, state: RobotState) -> str:
-        """Return how a limit of force or torque is exceeded; "" if none is."""
-        force, torque = state.grasp_force or 0.0, state.grasp_torque or 0.0
-        if force > self._settings.force_limit:
-            return f"pulls against the mechanism with {force:.0f} N"
-        if torque > self._settings.torque_limit:
-            return f"pulls against the mechanism with {torque:.0f} N·m"
-        return ""
-
-    def _end_pull(self, reason: str) -> tuple[Decision, str]:
-        """Brake where the robot really goes, and wait for the joint.
-
-        To brake on the path would be to pull on.
-        """
-        if self._robot.time < self._sent[-1][0] and len(self._sent) > 1:
-            self._sent.pop()  # a motion that has not begun, and never will
-        plan = self._plan
-        state = self._robot.read()
-        measured = self._get_motion_time(state.time)
-        size = plan.trajectory.robot_size
-        error = state.positions - plan.trajectory.at(measured)[:size]
-        error_rate = state.velocities - plan.trajectory.velocity(measured)[:size]
-        begin = self._robot.time + _BRAKE_DELAY
-        motion_time = self._get_motion_time(begin)
-        motion = brake(
-            plan.scene,
-            plan.trajectory,
-            motion_time,
-            plan.options,
-            error=error + error_rate * (motion_time - measured),
-            error_rate=error_rate,
-        )
         self._robot.send(motion, begin)
         if self._waiting is None:
             try:
@@ -406,9 +385,19 @@ class _Loop:
         self._sent.append((begin, stop))
         self._rest_since = begin + float(motion.times[-1])
         self._attempts = 0
-        self._pull = reason
-        self._is_released = False
+        if pulls:
+            self._pull = reason
+            self._is_released = False
         return "brake", reason
+
+    def _find_overload(self, state: RobotState) -> str:
+        """Return how a limit of force or torque is exceeded; "" if none is."""
+        force, torque = state.grasp_force or 0.0, state.grasp_torque or 0.0
+        if force > self._settings.force_limit:
+            return f"pulls against the mechanism with {force:.0f} N"
+        if torque > self._settings.torque_limit:
+            return f"pulls against the mechanism with {torque:.0f} N·m"
+        return ""
 
     def _plan_from_rest(
         self, now: float, waiting: tuple[tuple[Step, ...], Trajectory]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from vkc_pin.options import Options
 from vkc_pin.planning.retiming.limits import Limits
@@ -30,8 +31,8 @@ def brake(
     time: float,
     options: Options,
     *,
-    error: Floats | None = None,
-    error_rate: Floats | None = None,
+    error: ArrayLike = 0.0,
+    error_rate: ArrayLike = 0.0,
 ) -> Trajectory:
     """Return a motion along a path that comes to rest as soon as possible.
 
@@ -44,16 +45,16 @@ def brake(
     r ≤ 1, so that there always is one.
 
     A robot whose hand is guided by something is off the path: by e = `error` at first, which grows
-    with e' = `error_rate`. It is braked on q(τ) + e + e' (τ - `time`), which is where it really goes,
-    up to terms of second order.
+    with e' = `error_rate`. It is braked on q(τ) + e + e' (τ - `time`), which is where it really
+    goes, up to terms of second order.
 
     Args:
         scene: Scene of the motion.
         motion: Smooth motion within the limits.
         time: Time at which braking begins [s].
         options: Options of planning.
-        error: Distance of the robot from the path then, shape (n,), [m] and [rad]; None: zero.
-        error_rate: Its rate, shape (n,), [m/s] and [rad/s]; None: zero.
+        error: Distance of the robot from the path then, shape (n,), [m] and [rad].
+        error_rate: Its rate, shape (n,), [m/s] and [rad/s].
 
     Returns:
         The motion from `time` on, which counts from 0.
@@ -83,10 +84,8 @@ def brake(
         squares.append(next_square)
     offset = np.zeros(len(motion.names))
     slope = np.zeros(len(motion.names))
-    if error is not None:
-        offset[: motion.robot_size] = error
-    if error_rate is not None:
-        slope[: motion.robot_size] = error_rate
+    offset[: motion.robot_size] = error
+    slope[: motion.robot_size] = error_rate
     return _run_through(motion, np.array(clocks), np.sqrt(squares), offset, slope)
 
 

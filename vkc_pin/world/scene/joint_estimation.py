@@ -288,7 +288,7 @@ class _Fit:
             right = -jacobian.T @ residuals.ravel()
             while True:
                 damped = normal + damping * np.diag(np.diag(normal) + _FLOOR)
-                step = np.linalg.solve(damped, right)
+                step = np.asarray(np.linalg.solve(damped, right), float)
                 turns = -(np.sum(slopes * residuals, axis=1) + along @ step)
                 changed = self._displace(step, turns)
                 new_cost = self._compute_cost(changed)

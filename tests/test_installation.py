@@ -24,6 +24,7 @@ EXTRAS = {
     "notebook": ["show"],
     "ros": ["record"],
     "sim": ["simulate"],
+    "usd": ["stage"],
 }
 """Scripts that run in the environment of each extra; "" is the plain installation."""
 NOT_TESTED = {"docs", "peers", "test"}  # `peers` is large and serves one experiment

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
 def add_importing(commands: Any) -> None:
     """Add the commands to those of a parser."""
-    about = "Import a robot from a URDF, xacro, MJCF or SDF file, and report all guesses."
+    about = "Import a robot from a URDF, xacro, MJCF, SDF or USD file, and report all guesses."
     robot = add_command(commands, "import-robot", "import a robot", _import_robot, about)
-    add_option(robot, "file FILE", "URDF, xacro, MJCF or SDF")
+    add_option(robot, "file FILE", "URDF, xacro, MJCF, SDF or USD")
     _add_output(robot, "import-robot")
     add_option(robot, "--arm NAME", "the arm to plan for, or a part of its name, e.g. left")
     add_option(robot, "--tool-frame FRAME", "the tool frame, if it is not to be guessed")
@@ -42,12 +42,12 @@ def add_importing(commands: Any) -> None:
     add_seed(robot)
 
     about = (
-        "Import an object from a URDF, xacro, MJCF or SDF file: convex pieces, joint limits, "
+        "Import an object from a URDF, xacro, MJCF, SDF or USD file: convex pieces, joint limits, "
         "attachments proposed from its shapes, and a picture of them. The report lists changes, "
         "and joints that no hand can open."
     )
     item = add_command(commands, "import-object", "import an object", _import_object, about)
-    add_option(item, "file FILE", "URDF, xacro, MJCF or SDF")
+    add_option(item, "file FILE", "URDF, xacro, MJCF, SDF or USD")
     _add_output(item, "import-object")
     size = item.add_mutually_exclusive_group()
     about = "height, for files without a unit (PartNet-Mobility)"
@@ -60,13 +60,13 @@ def add_importing(commands: Any) -> None:
     _add_hand(item, most=3)
 
     about = (
-        "Import a whole home from a URDF, xacro, MJCF or SDF file as a scene: fixed parts become "
-        "obstacles of convex pieces, parts with joints become objects with proposed attachments, "
+        "Import a whole home from a URDF, xacro, MJCF, SDF or USD file as a scene: fixed parts "
+        "become obstacles of convex pieces, parts with joints become objects with attachments, "
         "and free parts become objects to carry. The robot starts at a free pose. The report lists "
         "changes, and parts that no hand can move."
     )
     home = add_command(commands, "import-home", "import a whole home", _import_home, about)
-    add_option(home, "file FILE", "URDF, xacro, MJCF or SDF")
+    add_option(home, "file FILE", "URDF, xacro, MJCF, SDF or USD")
     _add_output(home, "import-home")
     about = "height of the floor in the file (default 0)"
     add_option(home, "--floor METRES", about, type=float, default=0.0)

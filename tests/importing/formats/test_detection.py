@@ -17,10 +17,6 @@ IMPORTERS: dict[str, Callable[..., Any]] = {
     "import-robot": vkc.importing.import_robot,
 }
 OTHERS = {
-    "a.usda": (b'#usda 1.0\ndef Xform "a" {}\n', "USD is not supported"),
-    "renamed.urdf": (b"#usda 1.0\n", "USD is not supported"),
-    "a.usd": (b"PXR-USDC\x00\xb8\xff", "USD is not supported"),
-    "a.usdz": (b"PK\x03\x04\x00\xb8", "USD is not supported"),
     "a.glb": (b"glTF\x02\x00\x00\x00\xb8", "glTF is not supported"),
     "a.gltf": (b'{"asset": {"version": "2.0"}}', "glTF is not supported"),
     "a.ply": (b"ply\nformat binary_little_endian 1.0\n\xb8", "PLY is not supported"),
@@ -57,9 +53,9 @@ def test_xml_is_read_whatever_precedes_its_first_element(head: str, tmp_path: Pa
 
 
 def test_command_ends_with_exit_code_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "a.usda").write_text("#usda 1.0\n")
-    assert main(["import-home", str(tmp_path / "a.usda")]) == 2
-    assert "USD is not supported" in capsys.readouterr().err
+    (tmp_path / "a.glb").write_bytes(b"glTF")
+    assert main(["import-home", str(tmp_path / "a.glb")]) == 2
+    assert "glTF is not supported" in capsys.readouterr().err
 
 
 XACRO = """<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">

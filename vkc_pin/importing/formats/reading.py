@@ -19,6 +19,7 @@ from vkc_pin.importing.formats.detection import (
 from vkc_pin.importing.formats.mjcf import read_mjcf_description
 from vkc_pin.importing.formats.sdf import read_sdf_description
 from vkc_pin.importing.formats.urdf import read_urdf_description
+from vkc_pin.importing.formats.usd import read_usd_description
 from vkc_pin.importing.formats.xacro import expand_xacro
 from vkc_pin.utils.arguments import check_mapping
 from vkc_pin.world.files.resources import check_path
@@ -40,6 +41,7 @@ _READERS: Mapping[str, Callable[[Path, Folders, Arguments], Description]] = {
     "xacro": _read_xacro,
     "MJCF": lambda file, packages, _: read_mjcf_description(file),
     "SDF": lambda file, packages, _: read_sdf_description(file, packages),
+    "USD": lambda file, packages, _: read_usd_description(file, packages),
 }
 """Reader of each format; `detect_format` names the formats."""
 FORMATS = list_formats(_READERS)

@@ -110,7 +110,7 @@ def import_object(  # noqa: PLR0913 - keyword options of a public call
     packages: Mapping[str, str | Path] | None = None,
     arguments: Mapping[str, str] | None = None,
 ) -> ImportedObject:
-    """Import an object from a URDF, xacro, MJCF or SDF file.
+    """Import an object from a URDF, xacro, MJCF, SDF or USD file.
 
     Its shapes become convex pieces, fixed links are merged with their masses, and missing limits
     chosen. The origin is below the centre, at the height of the lowest point.

@@ -119,7 +119,7 @@ def import_robot(  # noqa: PLR0913 - keyword options of a public call
     seed: int = 0,
     force: bool = False,
 ) -> ImportedRobot:
-    """Import a robot from a URDF, xacro, MJCF or SDF file.
+    """Import a robot from a URDF, xacro, MJCF, SDF or USD file.
 
     The output folder holds robot.yaml, a URDF with a frame `tool` where the hand grasps, an SRDF
     with sampled pairs that need no check, and meshes, with convex pieces for collision; scene.yaml,

@@ -199,7 +199,7 @@ def place_bodies(file: Path, root: str, values: Mapping[str, float]) -> dict[str
     the reverse where `body1` is nearer to `root`.
 
     Args:
-        file: A stage whose bodies are a tree.
+        file: A stage whose bodies are a tree, apart from joints that are excluded.
         root: Path of the body that stays in its place, or "" for the world.
         values: Positions of joints by their paths, degrees or lengths of the stage.
 
@@ -219,6 +219,8 @@ def place_bodies(file: Path, root: str, values: Mapping[str, float]) -> dict[str
     edges = list[tuple[str, str, np.ndarray, np.ndarray, np.ndarray]]()
     for kind in (kinds.FixedJoint, kinds.RevoluteJoint, kinds.PrismaticJoint):
         for path, joint in zip(*found.get(kind, ((), ())), strict=True):
+            if joint.excludeFromArticulation:
+                continue
             value = values.get(str(path), 0.0)
             motion = np.eye(4)
             if kind != kinds.FixedJoint:

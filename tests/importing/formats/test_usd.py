@@ -797,6 +797,18 @@ def test_a_group_can_state_the_collision_of_its_instances(tmp_path: Path) -> Non
     assert get_vertices(found.links["a"].visual[1])[:, 0].mean() == pytest.approx(1.0, abs=1e-6)
 
 
+def test_bodies_inside_of_a_collider_do_not_collide_by_it(tmp_path: Path) -> None:
+    stage = create_stage(tmp_path / "t.usda")
+    UsdPhysics.CollisionAPI.Apply(add_body(stage, "/a"))
+    add_body(stage, "/a/b")
+    for path in ("/a/one", "/a/b/two"):
+        UsdGeom.Cube.Define(stage, path)
+    found = read(stage)
+    assert [part.name for part in found.links["a"].collision] == ["one"]
+    assert found.links["b"].collision == ()
+    assert [part.name for part in found.links["b"].visual] == ["two"]
+
+
 # Masses
 
 
@@ -889,6 +901,17 @@ def test_principal_axes_that_are_not_stated_are_those_of_the_body(tmp_path: Path
     inertia = read(stage).links["a"].inertia
     assert np.allclose(inertia.inertia, np.diag([1.0, 2.0, 2.5]))
     assert np.allclose(inertia.lever, [0.1, 0.0, 0.0])
+
+
+def test_negative_moments_count_as_not_stated(tmp_path: Path) -> None:
+    stage = create_stage(tmp_path / "t.usda")
+    mass = UsdPhysics.MassAPI.Apply(add_body(stage, "/a"))
+    mass.CreateMassAttr(6.0)
+    mass.CreateDiagonalInertiaAttr((1.0, -2.0, 2.5))
+    add_box(stage, "/a/box")
+    found = read(stage)
+    assert has_note(found, "body /a: negative moments")
+    assert np.allclose(found.links["a"].inertia.inertia, np.eye(3))
 
 
 def test_open_meshes_weigh_as_much_as_their_hulls(tmp_path: Path) -> None:
@@ -984,6 +1007,27 @@ ERRORS = {
         "wrong faces",
         "/a/m",
     ),
+    "far away": (
+        BODY
+        % (
+            "double3 xformOp:translate = (1e9, 0, 0)\n"
+            'uniform token[] xformOpOrder = ["xformOp:translate"]'
+        ),
+        r"too large or too far away \(expected at most 10000 m \(metersPerUnit is 1\)",
+        "/a",
+    ),
+    "large": (
+        BODY % 'def Sphere "s" (prepend apiSchemas = ["PhysicsCollisionAPI"]) {\n'
+        "double radius = 20000\n}",
+        "too large",
+        "/a/s",
+    ),
+    "wrong type": (
+        'def Xform "a" (prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsMassAPI"]) {\n'
+        'string physics:mass = "heavy"\n}\n',
+        "a value of a wrong type: could not convert string to float",
+        "/a",
+    ),
     "point instancer": (
         f'def PointInstancer "p" {{\nrel prototypes = </p/c>\n{CUBE}}}\n' + BODY % CUBE,
         "a point instancer places colliders",
@@ -1012,7 +1056,7 @@ def test_wrong_files_name_the_prim_or_the_layer(tmp_path: Path, name: str) -> No
 
 def test_renamed_files_need_their_suffix(tmp_path: Path) -> None:
     (tmp_path / "t.urdf").write_text("#usda 1.0\n" + BODY % CUBE)
-    with pytest.raises(InputError, match=r"expected the suffix .usd, .* got .urdf"):
+    with pytest.raises(InputError, match=r"expected the suffix \.usd, .*got \.urdf"):
         read_description(tmp_path / "t.urdf")
 
 

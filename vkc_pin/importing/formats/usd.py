@@ -162,7 +162,9 @@ class _Reader:
         self._bodies = {body.path: body for body in stage.bodies}
         self._places = {WORLD: pin.SE3.Identity()}  # of bodies
         for body in stage.bodies:
-            self._places[body.path] = _extract_placement(self._metric @ body.matrix)
+            matrix = self._metric @ body.matrix
+            self._check_lengths(body.path, matrix[:3, 3])
+            self._places[body.path] = _extract_placement(matrix)
         self._frames = dict(self._places)  # of links, which may be moved to their joints
         self._names = _choose_names(self._bodies)
         world = "world"
@@ -175,6 +177,18 @@ class _Reader:
         self._positions = dict[str, float]()  # at which bodies are in the file, by child body
         self._zeros = dict[str, float]()  # what counts as zero, by child body
         self._meshes: dict[tuple[int, bytes], trimesh.Trimesh] = {}
+
+    def _check_lengths(self, path: str, lengths: Any) -> None:
+        """Check that a prim is neither too large nor too far away, [m]."""
+        largest = float(np.abs(lengths).max(initial=0.0))
+        if not largest <= MAX_COORDINATE:
+            raise InputError(
+                "too large or too far away",
+                file=self._file,
+                field=path,
+                expected=f"at most {MAX_COORDINATE:g} m (metersPerUnit is {self._stage.metres:g})",
+                got=f"{largest:.4g} m",
+            )
 
     def read(self) -> Description:
         """Return the description; see `read_usd_description`."""
@@ -238,6 +252,7 @@ class _Reader:
             self._notes.append(f"joint {joint.path} {holds}: left out")
             return []
         first, second = (self._place_anchor(end) for end in joint.ends)
+        self._check_lengths(joint.path, [first.translation, second.translation])
         anchors = (
             self._places[bodies[0]].actInv(first),
             self._places[bodies[1]].actInv(second),
@@ -621,6 +636,7 @@ class _Reader:
         matrix = self._find_matrix(shape, body)
         if shape.mesh is not None:
             triangles = self._transform_mesh(shape.mesh, matrix)
+            self._check_lengths(shape.path, triangles.vertices)
             return Part.from_triangles(_get_leaf(shape.path), triangles, shape.colour)
         return self._make_solid(shape, matrix, shape.kind, shape.size)
 
@@ -645,8 +661,10 @@ class _Reader:
         solid = _scale_solid(kind, size, scales) if is_square else None
         if solid is None:
             mesh = _make_surface(kind, size).apply_transform(matrix)
+            self._check_lengths(shape.path, mesh.vertices)
             return Part.from_triangles(name, mesh, shape.colour)
         kind, size = solid
+        self._check_lengths(shape.path, [*size, *matrix[:3, 3]])
         placement = _extract_placement(_make_matrix(rotation, matrix[:3, 3]))
         return Part(name=name, placement=placement, kind=kind, size=size, colour=shape.colour)
 
@@ -710,12 +728,25 @@ class _Reader:
             tensor = tensor + mass * (away @ away * np.eye(3) - np.outer(away, away))
             lever = stated
         if body.mass.moments is not None:
-            unit = self._stage.kilograms * self._stage.metres**2
-            axes = _extract_placement(in_link).rotation
-            if body.mass.axes is not None:
-                axes = axes @ _convert_quaternion(body.mass.axes)
-            tensor = axes @ np.diag(unit * body.mass.moments) @ axes.T
+            tensor = self._read_moments(body, in_link, tensor)
         return pin.Inertia(mass, lever, tensor), is_stated
+
+    def _read_moments(self, body: UsdBody, in_link: Floats, computed: Floats) -> Floats:
+        """Return the moments of inertia that a body states along its link's axes [kg·m²].
+
+        Impossible ones count as not stated, with a note.
+        """
+        assert body.mass.moments is not None
+        moments = self._stage.kilograms * self._stage.metres**2 * body.mass.moments
+        if not (moments >= 0.0).all():
+            self._notes.append(f"body {body.path}: negative moments of inertia count as not stated")
+            return computed
+        axes = _extract_placement(in_link).rotation
+        if body.mass.axes is not None:
+            axes = axes @ _convert_quaternion(body.mass.axes)
+        tensor = axes @ np.diag(moments) @ axes.T
+        # Equal up to rounding, which pinocchio does not accept of large ones
+        return np.asarray(0.5 * (tensor + tensor.T))
 
     def _find_density(self, body: UsdBody, collider: UsdShape) -> float | None:
         """Return the density of a collider [kg/m³]; None if nothing states it."""

@@ -8,6 +8,7 @@ and ignores a hinge's only limit. This module imports little, since the child pr
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import re
@@ -247,15 +248,16 @@ def _load(path: Path, file: Path, folders: Sequence[str]) -> UsdStage:
 
     try:
         layers = _open_layers(path, file, folders)
-        stage = Usd.Stage.Open(layers[0])
-    except Tf.ErrorException as error:
+        return _Reader(Usd.Stage.Open(layers[0]), file).read()
+    # usd-core quotes damaged layers in messages, which may be no text.
+    except (Tf.ErrorException, UnicodeDecodeError) as error:
         problem = f"USD cannot read the file: {_find_message(error)}"
         raise InputError(problem, file=file, expected=_READABLE) from error
-    return _Reader(stage, file).read()
 
 
 # Layers
 
+_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 _READABLE = "a layer that is neither damaged nor encrypted"
 
 
@@ -266,10 +268,13 @@ def _open_layers(path: Path, file: Path, folders: Sequence[str]) -> list[Any]:
     """
     from pxr import Ar, Sdf
 
+    # Which code reads a file is decided by its suffix.
+    if path.suffix.lower() not in _SUFFIXES:
+        expected = f"the suffix {', '.join(_SUFFIXES)}"
+        raise InputError("USD cannot read the file", file=file, expected=expected, got=path.suffix)
     root = Sdf.Layer.FindOrOpen(str(path))
     if root is None:
-        expected = "the suffix .usd, .usda, .usdc or .usdz"
-        raise InputError("USD cannot read the file", file=file, expected=expected, got=path.suffix)
+        raise InputError("USD cannot read the file", file=file, expected=_READABLE)
     layers = [root]
     known = {root.identifier}
     for layer in layers:
@@ -298,7 +303,7 @@ def _open_layer(anchored: str, file: Path, layer: Any, address: str) -> Any:
 
     try:
         opened = Sdf.Layer.FindOrOpen(anchored)
-    except Tf.ErrorException as error:
+    except (Tf.ErrorException, UnicodeDecodeError) as error:
         opened = None
         message = _find_message(error)
     else:
@@ -334,8 +339,11 @@ def _name_layer(layer: Any) -> str:
 
 
 def _find_message(error: Exception) -> str:
-    """Return the message of an error of usd-core, in one line."""
-    text = str(error)
+    """Return the message of an error of usd-core, in one line; it may quote what is no text."""
+    try:
+        text = str(error)
+    except UnicodeDecodeError as other:
+        text = str(other)
     match = _QUOTED.search(text)
     return " ".join((match[1] if match else text).split())
 
@@ -369,10 +377,12 @@ class _Reader:
         prims = list(self._list_prims())
         self._check_physics(prims)
         for prim in prims:
-            self._read_body(prim)
+            with self._explain_types(prim):
+                self._read_body(prim)
         for prim in prims:
-            self._read_shape(prim)
-            self._read_joint(prim)
+            with self._explain_types(prim):
+                self._read_shape(prim)
+                self._read_joint(prim)
         for reason, paths in self._left_out.items():
             more = ", ..." if len(paths) > _LISTED else ""
             self._found.notes.append(f"{reason}: {', '.join(paths[:_LISTED])}{more}")
@@ -463,6 +473,17 @@ class _Reader:
     ) -> InputError:
         path = str(prim.GetPath())
         return InputError(problem, file=self._file, field=path, expected=expected, got=got)
+
+    @contextlib.contextmanager
+    def _explain_types(self, prim: Any) -> Iterator[None]:
+        """Name the prim of a value that a layer states with another type than its schema."""
+        try:
+            yield
+        except (InputError, UnicodeDecodeError):
+            raise
+        except (AttributeError, OverflowError, TypeError, ValueError) as error:
+            message = " ".join(str(error).split())
+            raise self._make_error(prim, f"a value of a wrong type: {message}") from error
 
     def _find_matrix(self, prim: Any) -> Floats:
         """Return the frame of a prim in the stage, for columns, shape (4, 4)."""

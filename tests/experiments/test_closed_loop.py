@@ -13,6 +13,7 @@ from vkc_pin.experiments.closed_loop import ROWS, _disturb
 from vkc_pin.experiments.tasks import TASKS, make_start
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.prepare import plan
+from vkc_pin.world.scene.measured_joints import find_axis
 
 
 @pytest.fixture(scope="module")
@@ -63,3 +64,20 @@ def test_obstacle_is_where_it_is_seen(row: str, drawer_plan: Plan) -> None:
 
 def test_every_row_is_explained() -> None:
     assert all(about and not about.endswith(".") for about in ROWS.values())
+
+
+def test_axis_is_elsewhere_and_the_handle_is_not(drawer_plan: Plan) -> None:
+    scene = drawer_plan.scene
+    actual = _disturb("axis", drawer_plan, np.random.default_rng(0)).actual
+    before, after = scene.objects["drawer"], actual.objects["drawer"]
+    assert after.link_placement("tray").isApprox(before.link_placement("tray"), 1e-12)
+    _, described, _ = find_axis(before, "slide")
+    _, real, _ = find_axis(after, "slide")
+    assert 0.0 < np.arccos(described @ real) < np.radians(5.0)
+
+
+def test_axis_of_a_cup_is_no_trial(tmp_path: Path) -> None:
+    arguments = "closed-loop --trials 1 --tasks household_cup --rows axis"
+    table, trials = run_experiment(arguments, tmp_path)
+    assert trials == []
+    assert "| axis | household_cup | does not apply: no joint |" in table

@@ -274,15 +274,16 @@ class _Loop:
         if now - state.time > _STALE:
             self._robot.stop()
             return "stop", f"the robot's state is {now - state.time:.2g} s old"
+        overload = self._find_overload(state) if now >= begin else ""
+        if overload and not self._pull:
+            return self._brake(overload, pulls=True)
         if self._settings.observer is not None and now >= begin:
             self._joint = self._settings.observer.observe(plan, self._get_motion_time(now))
             if self._joint is not None and self._joint.is_other_kind:
                 self._robot.stop()
                 return "stop", self._joint.reason
-        overload = self._find_overload(state) if now >= begin else ""
-        if not self._pull and (overload or self._joint is not None):
-            why = overload if self._joint is None else self._joint.reason
-            return self._brake(why, pulls=True)
+            if self._joint is not None and not self._pull:
+                return self._brake(self._joint.reason, pulls=True)
         if self._waiting is not None:
             return self._plan_from_rest(now, self._waiting)
         if min(now, state.time) < begin:

@@ -88,7 +88,7 @@ def test_known_axis_is_contradicted_only_where_it_is_wrong() -> None:
     across = np.cross(axis, link.translation - point)
     tilted = pin.exp3(0.08 * across / np.linalg.norm(across)) @ axis
     for known, expected in (((axis, point), False), ((tilted, point), True)):
-        information = compute_information(poses, "revolute", *known, **noise)
+        information = compute_information(poses, "revolute", known, **noise)
         is_contradicted = information - found.information["revolute"] >= DECISIVE
         assert is_contradicted == expected
     turned = found.align(-found.axis)
@@ -152,6 +152,7 @@ def test_short_motions_are_refused(turned: float, slid: float, message: str) -> 
     [
         ({"poses": [pin.SE3.Identity()] * 3}, "too few poses .*4 or more, got 3"),
         ({"poses": [pin.SE3.Identity()] * 4 + [[0.0, 1.0]]}, r"poses\[4\]"),
+        ({"poses": [pin.SE3.Identity()] * 4 + [pin.SE3(np.eye(3), np.full(3, np.nan))]}, r"\[4\]"),
         ({"poses": [pin.SE3.Identity()] * 4, "position_noise": 0.0}, "position_noise"),
     ],
 )

@@ -121,21 +121,21 @@ def estimate_joint(
 def compute_information(
     poses: Sequence[pin.SE3 | Sequence[float]],
     kind: JointKind,
-    axis: Floats,
-    point: Floats,
+    known: tuple[Floats, Floats] | None = None,
     *,
     position_noise: float = 0.001,
     rotation_noise: float = 0.005,
 ) -> float:
-    """Return the Bayesian information criterion of a joint whose axis is known.
+    """Return the Bayesian information criterion of a kind of joint.
 
-    If it exceeds that of an estimate by `DECISIVE`, the axis is very probably elsewhere.
+    If that of a known axis exceeds that of any axis by `DECISIVE`, the axis is very probably
+    elsewhere.
 
     Args:
         poses: See `estimate_joint`.
         kind: Kind of the joint.
-        axis: Unit direction of its axis in the frame of the poses, shape (3,).
-        point: A point of its axis, shape (3,) [m].
+        known: Unit direction of its axis in the frame of the poses, shape (3,), and a point of it,
+            shape (3,) [m]. Default: those that fit best.
         position_noise: See `estimate_joint`.
         rotation_noise: See `estimate_joint`.
 
@@ -143,7 +143,7 @@ def compute_information(
         InputError: A pose is invalid, or there are less than four.
     """
     data = _make_data(poses, position_noise, rotation_noise)
-    return _Fit(kind, data, (axis, point)).information
+    return _Fit(kind, data, known).information
 
 
 def _make_data(
@@ -157,8 +157,15 @@ def _make_data(
         raise InputError(
             "too few poses", field="poses", expected=f"{FEWEST_POSES} or more", got=len(listed)
         )
-    placements = [as_placement(pose, name=f"poses[{k}]") for k, pose in enumerate(listed)]
-    return _Data(placements, position_noise, rotation_noise)
+    placements = [
+        pose if isinstance(pose, pin.SE3) else as_placement(pose, name=f"poses[{k}]")
+        for k, pose in enumerate(listed)
+    ]
+    data = _Data(placements, position_noise, rotation_noise)
+    if not (np.isfinite(data.rotations).all() and np.isfinite(data.translations).all()):
+        for k, pose in enumerate(placements):
+            as_placement(pose, name=f"poses[{k}]")  # names the first invalid one
+    return data
 
 
 def _make_refusal(data: _Data, doubt: str) -> InputError:

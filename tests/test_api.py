@@ -24,6 +24,7 @@ COMPILED = tuple(
         "world.collision._distances",
         "planning.base_paths._driving",
         "planning.solver._kkt",
+        "planning.retiming._speeds",
     )
 )
 SCRIPTS = (*COMPILED, "vkc_pin.visualization.server", "vkc_pin.cli.__main__")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -138,7 +139,10 @@ class JointObserver:
         if len(poses) < FEWEST_POSES:
             return None
         placements = [pose.placement for pose in poses]
-        noise = {"position_noise": self._position_noise, "rotation_noise": self._rotation_noise}
+        noise: dict[str, Any] = {
+            "position_noise": self._position_noise,
+            "rotation_noise": self._rotation_noise,
+        }
         kind, axis, point = find_axis(there, joint)
         known = compute_information(placements, kind, (axis, point), **noise)
         # The estimate fits the other kind, too, for which most cycles have no time.

@@ -8,6 +8,7 @@ from helpers.door_closers import load_door_with_closer
 from helpers.executions import plan_door
 
 from vkc_pin.planning.retiming.cubic_path import CubicPath
+from vkc_pin.planning.retiming.topp_ra import PathSamples
 from vkc_pin.planning.retiming.torque_bounds import TorqueBounds
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.torques import Torques
@@ -29,12 +30,14 @@ def test_linearized_torques_equal_torques(speed: float, change: float) -> None:
         damping=200.0, friction=4.0, stiffness=5.0, springref=-2.0
     )
     path = CubicPath(curve.times - curve.times[0], curve.positions, curve.rates)
-    places = np.linspace(path.x[2], path.x[-3], 5)
-    push, square, rest = bounds.linearize(path, path.x, np.full(len(path.x), speed), places)
-    tangents, bends = path(places, 1), path(places, 2)
-    phases = np.full(5, len(torques.trajectory.phases) - 1)
+    samples = PathSamples.from_positions(path, path.x)
+    count = len(samples.positions)
+    path_torques = bounds.evaluate_along_path(path, samples)
+    push, square, rest = path_torques.linearize(np.full(count, speed))
+    points, tangents, bends = (path(samples.positions, order, samples.cubics) for order in range(3))
+    phases = np.full(count, len(torques.trajectory.phases) - 1)
     accelerations = speed**2 * bends + change * tangents
-    direct = torques.at(phases, path(places), speed * tangents, accelerations)
+    direct = torques.at(phases, points, speed * tangents, accelerations)
     limits = torques.torque_limits.limits
     expected = (direct / limits)[:, np.isfinite(limits)]
     np.testing.assert_allclose(push * change + square * speed**2 + rest, expected, atol=1e-9)

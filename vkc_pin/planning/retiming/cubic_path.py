@@ -7,7 +7,7 @@ from math import perm
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.arrays import Floats, Ints
 
 
 class CubicPath:
@@ -36,15 +36,18 @@ class CubicPath:
         cubic = bends / widths
         self._coefficients = (constant, linear, quadratic, cubic)
 
-    def __call__(self, positions: ArrayLike, order: int = 0) -> Floats:
-        """Return a derivative, shape (..., n), at path positions, shape (...,), right of knots.
+    def __call__(self, positions: ArrayLike, order: int = 0, cubics: Ints | None = None) -> Floats:
+        """Return a derivative, shape (..., n), at path positions, shape (...,).
 
         Args:
             positions: Path positions.
             order: Order of the derivative, 0 to 3.
+            cubics: Cubic that each belongs to, shape (...,). Defaults to that right of knots.
         """
         at = np.asarray(positions, float)
-        interval = np.searchsorted(self.x[1:-1], at, side="right")
+        interval = cubics
+        if interval is None:
+            interval = np.searchsorted(self.x[1:-1], at, side="right")
         distance = (at - self.x[interval])[..., None]
         coordinate_count = self._coefficients[0].shape[1]
         derivative = np.zeros((*at.shape, coordinate_count))

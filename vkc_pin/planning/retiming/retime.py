@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from vkc_pin.planning.retiming.braking import make_accelerating_curve, make_brak
 from vkc_pin.planning.retiming.cubic_path import CubicPath
 from vkc_pin.planning.retiming.limits import Limits, limit_jerk
 from vkc_pin.planning.retiming.spline_path import fit_path
-from vkc_pin.planning.retiming.topp_ra import compute_speeds
+from vkc_pin.planning.retiming.topp_ra import PathSamples, compute_speeds
 from vkc_pin.planning.retiming.torque_bounds import TorqueBounds
 from vkc_pin.planning.retiming.wheeled_paths import compute_slip, fit_rolling_paths
 from vkc_pin.utils.arrays import Bools, Floats, Ints
@@ -386,8 +385,10 @@ def _retime_path(
         return curve, waypoints
     # Viscous torques are linear in the speed, TOPP-RA takes its square: they are linearised in it
     # around the last speeds.
+    samples = PathSamples.from_positions(path, places)
+    path_torques = torque_bounds.evaluate_along_path(path, samples)
     for _ in range(_TORQUE_ITERATIONS):
-        linear = partial(torque_bounds.linearize, path, places, speeds)
+        linear = path_torques.linearize(np.interp(samples.positions, places, speeds))
         slower = compute_speeds(path, places, limits.velocity, limits.acceleration, linear)
         if slower is None:
             break

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vkc_pin.planning.retiming.cubic_path import CubicPath
+from vkc_pin.planning.retiming.topp_ra import PathSamples
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.torques import Torques, sample_curve
@@ -59,7 +60,6 @@ class TorqueBounds:
     def __init__(self, torques: Torques, phases: Ints) -> None:
         self._torques = torques
         self._phases = phases
-        self._torques_by_positions: dict[bytes, PathTorques] = {}
         self._limited = np.flatnonzero(np.isfinite(torques.torque_limits.limits))
 
     def select_steps(self, first: int, count: int) -> TorqueBounds:
@@ -83,33 +83,18 @@ class TorqueBounds:
         torques = self._torques.at(phases, positions, velocities, accelerations)
         return torques[:, self._limited] / self._torques.torque_limits.limits[self._limited]
 
-    def linearize(
-        self, path: CubicPath, speed_positions: Floats, speeds: Floats, positions: Floats
-    ) -> tuple[Floats, Floats, Floats]:
-        """Return the coefficients of `PathTorques.linearize` at positions of a path, shape (K,).
-
-        `speeds` are those at `speed_positions`, shape (J,) each.
-        """
-        key = positions.tobytes()
-        if key not in self._torques_by_positions:
-            self._torques_by_positions[key] = self._evaluate_along_path(path, positions)
-        # At constant acceleration w² is linear in the position.
-        speeds_there = np.sqrt(np.interp(positions, speed_positions, speeds**2))
-        return self._torques_by_positions[key].linearize(speeds_there)
-
-    def _evaluate_along_path(self, path: CubicPath, positions: Floats) -> PathTorques:
-        """Return the torques at positions of a path, shape (K,).
+    def evaluate_along_path(self, path: CubicPath, samples: PathSamples) -> PathTorques:
+        """Return the torques at S samples of a path.
 
         The coefficients follow from τ(1, 0), τ(2, 0), τ(3, 0) and τ(1, 1). At w and u the
         velocities of the coordinates are q′ w and their accelerations q′ u + q″ w².
         """
         n_pieces = len(path.x) - 1
         size = len(self._torques.trajectory.names)
-        pieces = np.searchsorted(path.x, positions, side="right") - 1
-        pieces = np.clip(pieces, 0, n_pieces - 1)
-        points = path(positions, 0)[:, :size]
-        tangents = path(positions, 1)[:, :size]
-        curvatures = path(positions, 2)[:, :size]
+        pieces = samples.cubics
+        points = path(samples.positions, 0, pieces)[:, :size]
+        tangents = path(samples.positions, 1, pieces)[:, :size]
+        curvatures = path(samples.positions, 2, pieces)[:, :size]
 
         def compute_at(w: float) -> Floats:
             return self._compute_ratios(pieces, n_pieces, points, w * tangents, w**2 * curvatures)

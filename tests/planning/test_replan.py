@@ -12,6 +12,7 @@ import pytest
 import vkc_pin as vkc
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.planning.replan import find_remaining_steps
+from vkc_pin.planning.stopping import brake
 from vkc_pin.world.trajectory.splicing import extract_times
 
 OPEN = vkc.Actuate("door", {"hinge": 1.2})
@@ -83,6 +84,29 @@ def test_part_of_a_motion_is_the_motion_itself(begin: float, end: float) -> None
 
 # --- stops
 # ------------------------------------------------------------------------------------------------
+
+
+def test_robot_off_its_path_is_braked_where_it_goes() -> None:
+    """As a mechanism leads it: from the measured state, beside the path."""
+    plan = plan_door()
+    motion = plan.trajectory
+    size = motion.robot_size
+    time = 1.5
+    error = np.linspace(-0.01, 0.01, size)
+    rate = np.linspace(0.02, -0.01, size)
+    stop = brake(plan.scene, motion, time, plan.options, error=error, error_rate=rate)
+    on_path = brake(plan.scene, motion, time, plan.options)
+    np.testing.assert_array_equal(stop.times, on_path.times)
+    np.testing.assert_allclose(stop.at(0.0)[:size], motion.at(time)[:size] + error, atol=1e-9)
+    expected = motion.velocity(time)[:size] + rate
+    np.testing.assert_allclose(stop.velocity(0.0)[:size], expected, atol=1e-9)
+    end = float(stop.times[-1])
+    np.testing.assert_allclose(stop.velocity(end), 0.0, atol=1e-9)
+    # Beside the path by the error, and by its rate times the time of the path that passed
+    beside = (stop.at(end) - on_path.at(end))[:size] - error
+    passed = beside / rate
+    np.testing.assert_allclose(passed, passed[0], rtol=1e-6)
+    assert 0.0 < passed[0] < end
 
 
 def test_stop_brakes_on_the_path_within_the_limits() -> None:

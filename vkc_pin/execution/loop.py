@@ -282,7 +282,8 @@ class _Loop:
             if self._joint is not None and self._joint.is_other_kind:
                 self._robot.stop()
                 return "stop", self._joint.reason
-            if self._joint is not None and not self._pull:
+            left = float(plan.trajectory.times[-1]) - self._get_motion_time(now)
+            if self._joint is not None and not self._pull and left > self._settings.lead:
                 return self._brake(self._joint.reason, pulls=True)
         if self._waiting is not None:
             return self._plan_from_rest(now, self._waiting)

@@ -14,7 +14,8 @@ from vkc_pin.world.models.robot import Robot
 
 _EXPECTED = "a velocity [m/s] or [rad/s]"
 _LIMIT_SLACK = 1e-6  # relative excess over a limit that counts as rounding
-_MAX_SLIP = 1e-6  # [m/s], sideways, or missing for the turn
+# [m/s], sideways, or missing for the turn: what validation accepts along motions
+_MAX_SLIP = 1e-3
 
 
 def make_robot_velocity(

@@ -19,6 +19,9 @@ demo: $(VENV)/installed.stamp
 	@mkdir -p out
 	$(BIN)/vkc-pin plan door --set door.hinge=1.2 --html out/door.html --save out/door.npz --json out/door.json --plots out
 
+# Python compiles each module that it imports once, not in every process, wherever the environment forbids that: tests start many.
+export PYTHONDONTWRITEBYTECODE :=
+
 # One process a core, each with one thread; files stay whole, since their tests share problems and plans.
 PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
 

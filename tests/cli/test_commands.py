@@ -29,12 +29,12 @@ def run_misused(run: RunCommand, command: str) -> str:
 
 
 def test_plan_prints_a_report_and_writes_every_output(run: RunCommand) -> None:
-    outputs = {kind: f"new/out/door.{kind}" for kind in ("html", "json", "plots")}
-    outputs["save"] = "new/out/door.npz"
+    outputs = {kind: f"new/out/drawer.{kind}" for kind in ("html", "json", "plots")}
+    outputs["save"] = "new/out/drawer.npz"
     files = " ".join(f"--{kind} {name}" for kind, name in outputs.items())
-    result = run(f"plan door --set door.hinge=1.2 {files}")
+    result = run(f"plan drawer --set drawer.slide=0.3 {files}")
     assert result.code == 0, result.err
-    assert "door: success" in result.out
+    assert "drawer: success" in result.out
     assert "every constraint holds" in result.out
     for name in outputs.values():
         assert f"wrote {name}" in result.out

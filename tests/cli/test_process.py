@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import yaml
 
 import vkc_pin as vkc
 
@@ -140,9 +141,22 @@ def test_characters_outside_the_encoding_are_escaped(
 
 
 def test_warnings_name_the_file_and_no_code(tmp_path: Path, shell: Shell) -> None:
-    scene = (ROOT / "scenes" / "drawer.yaml").read_text()
-    box = "{name: box, type: box, size: [.6, .3, .3], position: [1.8, 0, .7]}"
-    (tmp_path / "scene.yaml").write_text(f"{scene}  - {box}\n")
+    box = "<collision><geometry><box size='0.2 0.2 0.2'/></geometry></collision>"
+    lid = (
+        f"<robot name='chest'><link name='chest'/><link name='lid'>{box}</link>"
+        "<joint name='hinge' type='revolute'><parent link='chest'/><child link='lid'/>"
+        "<axis xyz='0 1 0'/><limit lower='0' upper='1' velocity='1' effort='1'/></joint></robot>"
+    )
+    beam = {"name": "beam", "type": "box", "size": [0.1, 0.1, 0.1], "position": [2.0, 0.0, 0.5]}
+    # Without attachments there is nothing to reach, which would take longest to check.
+    chest = {"name": "chest", "type": {"urdf": lid, "attachments": []}, "position": [2.0, 0.0, 0.5]}
+    scene = {
+        "robot": "husky_ur5e",
+        "start": {"base": [0.0, 0.0, 0.0]},
+        "objects": [chest],
+        "obstacles": [beam],
+    }
+    (tmp_path / "scene.yaml").write_text(yaml.safe_dump(scene), encoding="utf-8")
     done = shell("", "check scene.yaml")
     assert done.stderr.startswith("vkc-pin: scene.yaml: movable links overlap other shapes: ")
     assert "Warning" not in done.stderr

@@ -100,7 +100,9 @@ def test_robots_of_scenes_are_copied(tmp_path: Path) -> None:
 
 def test_robot_yaml_of_another_urdf_is_not_copied(tmp_path: Path) -> None:
     scene = write_scene_with_own_robot(tmp_path)
-    shutil.copy(tmp_path / "rover/husky_ur5e.urdf", tmp_path / "rover/second.urdf")
+    for suffix in (".urdf", ".srdf"):
+        packaged = tmp_path / f"rover/husky_ur5e{suffix}"
+        shutil.copy(packaged, packaged.with_stem("second"))
     document = yaml.safe_load(scene.read_text(encoding="utf-8"))
     document |= {"robot": {"name": "rover/second.urdf"}, "start": {"base": [-0.8, 0.5, 0.4]}}
     scene.write_text(yaml.safe_dump(document), encoding="utf-8")

@@ -84,19 +84,32 @@ def test_links_of_a_robot_keep_their_names(tmp_path: Path) -> None:
     assert {*NAMES[4:10]} <= {*imported.robot.links}
 
 
+# Its only grasp is quickly found.
+DRAWER = (
+    f'<robot name="r">{format_link("case", "0.3 0.3 0.3", "0 0 0")}'
+    f"{format_link('knob', '0.04 0.04 0.04', '0 0 0')}"
+    f"{format_joint('slide', 'prismatic', 'case', 'knob', '-0.2 0 0', '-1 0 0')}</robot>"
+)
+
+
 @pytest.mark.parametrize(
-    ("import_file", "name", "description"),
+    ("import_file", "text", "description"),
     [
-        (vkc.importing.import_object, "cabinet.urdf", "[!s]*.yaml"),
-        (partial(vkc.importing.import_robot, samples=20), "robot.urdf", "robot.yaml"),
-        (vkc.importing.import_home, "cabinet.urdf", "scene.yaml"),
+        (partial(vkc.importing.import_object, most=1), DRAWER, "[!s]*.yaml"),
+        (
+            partial(vkc.importing.import_robot, samples=20),
+            (INPUTS / "robot.urdf").read_text(encoding="utf-8"),
+            "robot.yaml",
+        ),
+        (partial(vkc.importing.import_home, most=1), DRAWER, "scene.yaml"),
     ],
+    ids=["object", "robot", "home"],
 )
 def test_file_names_cannot_add_fields_to_the_description(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     import_file: Callable[[Path], Any],
-    name: str,
+    text: str,
     description: str,
 ) -> None:
     found = []
@@ -114,7 +127,7 @@ def test_file_names_cannot_add_fields_to_the_description(
         (tmp_path / str(number)).mkdir()
         monkeypatch.chdir(tmp_path / str(number))
         source = tmp_path / f"{stem}.urdf"
-        source.write_bytes((INPUTS / name).read_bytes())
+        source.write_text(text, encoding="utf-8")
         import_file(source)
         (folder,) = Path.cwd().iterdir()
         check_file_names(folder)

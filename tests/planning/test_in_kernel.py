@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from helpers.kernel import Kernel, start_kernel
 
-DOOR = """
-scene = vkc.load_scene("door").with_start(base=[-0.03, 0.09, -1.19])
-steps = [vkc.Actuate("door", {"hinge": 1.2})]
+DRAWER = """
+scene = vkc.load_scene("drawer")
+steps = [vkc.Actuate("drawer", {"slide": 0.3})]
 """
 PRINT_STATUS = (
     "print(plan.status, plan.success, len(plan.report.violations), len(plan.summary()) > 100)"
@@ -22,7 +22,7 @@ INTERRUPTED_STATUS = r"interrupted False [1-9]\d* True\n"
 @pytest.fixture(scope="module")
 def jupyter() -> Iterator[Kernel]:
     with start_kernel() as kernel:
-        kernel.run(DOOR)
+        kernel.run(DRAWER)
         yield kernel
 
 
@@ -60,7 +60,7 @@ def test_progress_is_one_line(jupyter: Kernel) -> None:
     *before, last = get_output(outputs).split("\r")
     assert len(before) > 3
     assert not any("\n" in text for text in before)
-    assert re.fullmatch(r"door: success — base .* m, arm .* rad, planned in [\d.]+ s *\n", last)
+    assert re.fullmatch(r"drawer: success — base .* m, arm .* rad, planned in [\d.]+ s *\n", last)
     assert jupyter.run("plan = vkc.plan(scene, steps)") == []
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +17,13 @@ from vkc_pin.world.trajectory.world_model import compute_final_scene
 
 STEPS = [vkc.Actuate("door", {"hinge": 1.2})]
 VELOCITY = {"base_x": 0.2, "elbow_joint": 0.1}
+SHORT = vkc.Options(reach_waypoints=16, move_waypoints=12)
 
 
 @pytest.fixture(scope="module")
 def moving_plan() -> vkc.Plan:
     """Return the plan of a door from a moving start."""
-    return vkc.plan(load_door_scene().with_start(velocity=VELOCITY), STEPS)
+    return vkc.plan(load_door_scene().with_start(velocity=VELOCITY), STEPS, options=SHORT)
 
 
 def test_door_is_opened_from_a_moving_start(moving_plan: vkc.Plan, tmp_path: Path) -> None:
@@ -62,7 +64,7 @@ def test_another_velocity_builds_nothing() -> None:
     plans = []
     for velocity in ({}, VELOCITY, {"base_x": 0.1, "base_y": 0.1}):
         scene = load_door_scene().with_start(velocity=velocity)
-        plans.append(vkc.plan(scene, STEPS, planner=planner))
+        plans.append(vkc.plan(scene, STEPS, planner=planner, options=SHORT))
     assert all(plan.success for plan in plans)
     assert plans[0].statistics.build_time > 0.0
     assert [plan.statistics.build_time for plan in plans[1:]] == [0.0, 0.0]
@@ -70,7 +72,7 @@ def test_another_velocity_builds_nothing() -> None:
 
 def test_jerk_limits_hold_from_a_moving_start() -> None:
     scene = load_door_scene().with_start(velocity=VELOCITY)
-    plan = vkc.plan(scene, STEPS, options=vkc.Options(jerk_time=0.1))
+    plan = vkc.plan(scene, STEPS, options=replace(SHORT, jerk_time=0.1))
     assert plan.success
     np.testing.assert_allclose(plan.trajectory.velocity(0.0)[:9], scene.start_velocity)
 
@@ -82,17 +84,18 @@ def test_wheels_begin_with_the_velocity_of_the_start(jerk_time: float) -> None:
     velocity = {"base_x": 0.3 * np.cos(yaw), "base_y": 0.3 * np.sin(yaw), "base_yaw": 0.2}
     scene = scene.with_start(velocity=velocity)
     x, y = scene.start[:2].tolist()
-    plan = vkc.plan(scene, [vkc.GoTo(x - 0.5, y + 0.5)], options=vkc.Options(jerk_time=jerk_time))
+    options = replace(SHORT, jerk_time=jerk_time)
+    plan = vkc.plan(scene, [vkc.GoTo(x - 0.5, y + 0.5)], options=options)
     assert plan.success
     np.testing.assert_allclose(plan.trajectory.velocity(0.0), scene.start_velocity, atol=1e-9)
 
 
 def test_drawer_in_the_hand_is_pulled_on() -> None:
     scene = vkc.load_scene("drawer")
-    first = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.15})])
+    first = vkc.plan(scene, [vkc.Actuate("drawer", {"slide": 0.15})], options=SHORT)
     after = compute_final_scene(scene, first.trajectory, first.trajectory.phases[-1].holds)
     moving = after.with_start(velocity={"base_x": -0.1})
-    plan = vkc.plan(moving, [vkc.Actuate("drawer", {"slide": 0.3})])
+    plan = vkc.plan(moving, [vkc.Actuate("drawer", {"slide": 0.3})], options=SHORT)
     assert plan.success
     slide = plan.trajectory.names.index("drawer.slide")
     assert plan.trajectory.velocity(0.0)[slide] == pytest.approx(0.1, abs=1e-3)
@@ -103,7 +106,8 @@ def test_planned_steps_continue_from_rest(moving_plan: vkc.Plan) -> None:
     trajectory = moving_plan.trajectory
     after = compute_final_scene(moving_plan.scene, trajectory, trajectory.phases[-1].holds)
     assert not after.start_velocity.any()
-    plan = vkc.plan(moving_plan.scene, [*STEPS, vkc.GoTo(-1.0, 0.5)], simultaneous=False)
+    steps = [*STEPS, vkc.GoTo(-1.0, 0.5)]
+    plan = vkc.plan(moving_plan.scene, steps, options=SHORT, simultaneous=False)
     assert plan.success
 
 

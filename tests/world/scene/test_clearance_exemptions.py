@@ -21,6 +21,7 @@ from vkc_pin.world.scene.clearance_exemptions import (
 )
 
 SAFE = 0.02
+SHORT = vkc.Options(reach_waypoints=16, move_waypoints=12)
 # y of the side of the drawer's front; the shut front extends from x = 1.885 to 1.903
 TRAY = 0.295
 HINGE = {"hinge": 1.2}
@@ -55,10 +56,11 @@ def make_wall_scene(*depths: float, folder: str | Path = ".", **fields: Any) -> 
 @given(gap=st.floats(0.001, 0.018), begin=st.floats(1.4, 1.8))
 @settings(max_examples=8, deadline=None)
 def test_drawer_is_exempt_from_a_panel_until_it_has_passed(gap: float, begin: float) -> None:
-    (close,) = find_close_pairs(make_panel_scene(gap, begin), SAFE)
+    scene = make_panel_scene(gap, begin)
+    (close,) = find_close_pairs(scene, SAFE)
     assert close[:2] == ("drawer.tray", "side")
     assert close.distance == pytest.approx(gap, abs=1e-6)
-    (one,) = find_clearance_exemptions(make_panel_scene(gap, begin), SAFE)
+    (one,) = find_clearance_exemptions(scene, SAFE)
     assert (one.margin, one.distance) == (0.0, close.distance)
     lower, upper = one.ranges["drawer.slide"]
     assert lower == -np.inf
@@ -66,7 +68,7 @@ def test_drawer_is_exempt_from_a_panel_until_it_has_passed(gap: float, begin: fl
     clear_at = 1.903 - begin + np.sqrt(SAFE**2 - gap**2)
     assert upper == (
         np.inf
-        if clear_at > load_drawer_scene().objects["drawer"].object.upper[0]
+        if clear_at > scene.objects["drawer"].object.upper[0]
         else pytest.approx(clear_at, abs=2e-4)
     )
 
@@ -215,7 +217,8 @@ def test_door_opens_and_closes_in_its_wall() -> None:
     (one,) = find_clearance_exemptions(scene, SAFE)
     assert one.is_between("wall_0", "door.panel")
     assert (one.margin, one.ranges) == (-np.inf, {"door.hinge": (-np.inf, np.inf)})
-    plan = vkc.plan(scene, [vkc.Actuate("door", HINGE), vkc.Actuate("door", {"hinge": 0.0})])
+    steps = [vkc.Actuate("door", HINGE), vkc.Actuate("door", {"hinge": 0.0})]
+    plan = vkc.plan(scene, steps, options=SHORT)
     assert plan.success, plan.summary()
     assert plan.report.clearance > 0.015  # of pairs that are not exempt
 
@@ -234,14 +237,14 @@ def test_cup_may_leave_but_not_enter_an_overlap() -> None:
 def test_allowed_margin_lets_a_leaf_turn_into_its_wall() -> None:
     """A gap of 3 mm is too small for a leaf 40 mm thick that turns about its edge."""
     scene = make_wall_scene(-0.003)
-    plan = vkc.plan(scene, [vkc.Actuate("door", HINGE)])
+    plan = vkc.plan(scene, [vkc.Actuate("door", HINGE)], options=SHORT)
     assert plan.status == "infeasible"
     (note,) = plan.report.notes
     assert "door.panel – wall_0" in note
     overlap = float(note.rpartition("overlap by ")[2].partition(" mm")[0])
     pair = {"pair": ["door", "wall_0"], "margin": -1e-3 * (overlap + 0.2)}
     enough = replace_scene_fields(scene, allow=[pair])
-    assert vkc.plan(enough, [vkc.Actuate("door", HINGE)]).success
+    assert vkc.plan(enough, [vkc.Actuate("door", HINGE)], options=SHORT).success
 
 
 def format_box(position: str, size: str) -> str:

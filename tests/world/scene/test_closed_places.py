@@ -7,6 +7,7 @@ Planner, validation and oracle decide that independently.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,8 @@ from oracle.judge import judge
 import vkc_pin as vkc
 from vkc_pin.world.scene.clearance_exemptions import MODEL_ERROR, find_clearance_exemptions
 
-SAFE = vkc.Options().dist_safe
+SHORT = vkc.Options(reach_waypoints=10, move_waypoints=8, turn_waypoints=12)
+SAFE = SHORT.dist_safe
 OPEN = {"refrigerator": 1.2, "cabinet": 1.2, "door": 1.2, "drawer": 0.35}
 JOINTS = {"refrigerator": "hinge", "cabinet": "hinge", "door": "hinge", "drawer": "slide"}
 
@@ -45,9 +47,24 @@ def make_open_scene(kind: str, *obstacles: dict[str, Any], **fields: Any) -> vkc
 @cache
 def plan_closing(kind: str) -> vkc.Plan:
     """Return the plan of closing furniture in an empty room."""
-    plan = vkc.plan(make_open_scene(kind), [vkc.Actuate("it", {JOINTS[kind]: 0.0})])
+    steps = [vkc.Actuate("it", {JOINTS[kind]: 0.0})]
+    plan = vkc.plan(make_open_scene(kind), steps, options=SHORT)
     assert plan.success, plan.summary()
     return plan
+
+
+@pytest.fixture(scope="module")
+def save_closing(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """Return a function that saves the plan of closing furniture, on which the oracle agrees."""
+    folder = tmp_path_factory.mktemp("closing")
+
+    @cache
+    def save(kind: str) -> Path:
+        saved = plan_closing(kind).save(folder / f"{kind}.npz")
+        assert judge(saved).agrees
+        return saved
+
+    return save
 
 
 def describe_pole(at: tuple[float, float, float], radius: float = 0.01) -> dict[str, Any]:
@@ -74,12 +91,14 @@ IN_THE_WAY = {
 
 
 @pytest.mark.parametrize("name", IN_THE_WAY)
-def test_furniture_does_not_close_through_obstacles(name: str, tmp_path: Path) -> None:
+def test_furniture_does_not_close_through_obstacles(
+    name: str, tmp_path: Path, save_closing: Callable[[str], Path]
+) -> None:
     kind, obstacle = IN_THE_WAY[name]
     closing = plan_closing(kind)
     scene = make_open_scene(kind, obstacle)
     assert all(one.margin >= 0.0 for one in find_clearance_exemptions(scene, SAFE))
-    plan = vkc.plan(scene, closing.steps)
+    plan = vkc.plan(scene, closing.steps, options=SHORT)
     assert plan.status == "infeasible"
     (note,) = plan.report.notes
     assert "proven: between " in note
@@ -87,10 +106,10 @@ def test_furniture_does_not_close_through_obstacles(name: str, tmp_path: Path) -
     report = vkc.validate(scene, closing.steps, closing.trajectory, closing.options)
     hits = {one.subject for one in report.violations if one.constraint == "penetration"}
     assert any(subject.startswith("it.") and "obstacle" in subject for subject in hits)
-    saved = closing.save(tmp_path / "empty.npz")
-    assert judge(saved).agrees
     changed = write_changed(
-        saved, tmp_path / "changed.npz", lambda c: c["scene"]["obstacles"].append(obstacle)
+        save_closing(kind),
+        tmp_path / "changed.npz",
+        lambda c: c["scene"]["obstacles"].append(obstacle),
     )
     found = judge(changed).found
     assert any(one.rule == "overlap" and "obstacle" in one.subject for one in found)
@@ -106,7 +125,8 @@ def test_small_overlap_of_closed_furniture_is_an_error_of_the_model(
 ) -> None:
     """A panel beside the closed drawer's front overlaps it, as in kitchens of other packages."""
     panel = describe_box("panel", [0.4, 0.1, 0.9], [2.1, FRONT - depth + 0.05, 0.45])
-    plan = vkc.plan(make_open_scene("drawer", panel), [vkc.Actuate("it", {"slide": 0.0})])
+    scene = make_open_scene("drawer", panel)
+    plan = vkc.plan(scene, [vkc.Actuate("it", {"slide": 0.0})], options=SHORT)
     assert plan.success == closes
     if closes:
         (used,) = plan.report.exemptions
@@ -166,12 +186,12 @@ def test_overlap_at_the_start_gets_no_deeper(name: str) -> None:
     kind, begin, goal, obstacle = BEGINNING_INSIDE[name]
     joint = JOINTS[kind]
     scene = make_quietly(kind, obstacle, state={joint: begin})
-    plan = vkc.plan(scene, [vkc.Actuate("it", {joint: goal})])
+    plan = vkc.plan(scene, [vkc.Actuate("it", {joint: goal})], options=SHORT)
     assert plan.status == "infeasible"
     assert "proven: between " in plan.report.notes[0]
     assert " – obstacle overlap by " in plan.report.notes[0]
     free = make_open_scene(kind, state={joint: begin})
-    through = vkc.plan(free, plan.steps)
+    through = vkc.plan(free, plan.steps, options=SHORT)
     assert through.success, through.summary()
     report = vkc.validate(scene, plan.steps, through.trajectory, plan.options)
     hits = {one.subject for one in report.violations if one.constraint == "penetration"}

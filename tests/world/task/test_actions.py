@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import cache
 
 import numpy as np
 import pytest
@@ -29,6 +30,12 @@ SHUT = vkc.Actuate("refrigerator", {"hinge": 0.0})
 CUP = (vkc.Grasp("cold_cup"), vkc.Place("cold_cup", TABLE))
 
 
+@cache
+def load_scene(name: str) -> vkc.Scene:
+    """Return a packaged scene, which is loaded once."""
+    return vkc.load_scene(name)
+
+
 def test_steps_with_one_object_form_one_action() -> None:
     actions: list[tuple[vkc.Step, ...]] = [
         (vkc.Grasp("refrigerator"), OPEN),
@@ -46,7 +53,7 @@ def test_steps_with_one_object_form_one_action() -> None:
 
 
 def test_steps_are_compiled_in_the_scene_after_the_previous_steps() -> None:
-    scene, options = vkc.load_scene("household"), vkc.Options()
+    scene, options = load_scene("household"), vkc.Options()
     steps = [OPEN, *CUP, SHUT]
     tasks = compile_each_step(scene, steps, options)
     assert [task.steps for task in tasks] == [(step,) for step in steps]
@@ -76,7 +83,7 @@ def test_error_names_the_first_infeasible_step(
     steps: list[vkc.Step], field: str, problem: str
 ) -> None:
     with expect_error(rf"{re.escape(field)}.*{problem}"):
-        compile_each_step(vkc.load_scene("household"), steps, vkc.Options())
+        compile_each_step(load_scene("household"), steps, vkc.Options())
 
 
 @pytest.mark.parametrize("is_supported", [True, False])
@@ -98,11 +105,11 @@ def test_free_object_is_regrasped_only_if_it_rests_on_a_support(is_supported: bo
 def test_only_the_grasp_of_a_step_is_repeated() -> None:
     """Neither one that moves other joints, nor one by a tool, which cannot be put down."""
     options = vkc.Options()
-    scene = vkc.load_scene("household").with_held({"dishwasher": "handle"})
+    scene = load_scene("household").with_held({"dishwasher": "handle"})
     task = compile_task(scene, [vkc.Actuate("dishwasher", {"door": 0.0})], options)
     assert not list(generate_regrasps(scene, task, options))
     assert [name for name, _ in generate_alternatives(task)] == ["dishwasher.door_push"]
-    fetch = vkc.load_scene("fetch").with_held(
+    fetch = load_scene("fetch").with_held(
         {"stick": "grip", "ball": "pull"}, by={"ball": "stick.tip"}
     )
     x, y, _ = fetch.objects["ball"].placement.translation
@@ -135,7 +142,7 @@ def test_alternatives_are_the_attachments_that_no_step_names(
     name: str, steps: list[vkc.Step], expected: list[str]
 ) -> None:
     """Neither a tool's attachments for the hand, nor the hand's for a tool."""
-    scene, options = vkc.load_scene(name), vkc.Options()
+    scene, options = load_scene(name), vkc.Options()
     alternatives = list(generate_alternatives(compile_task(scene, steps, options)))
     assert [label.partition(".")[2] for label, _ in alternatives] == expected
     for label, others in alternatives:
@@ -146,7 +153,7 @@ def test_alternatives_are_the_attachments_that_no_step_names(
 
 
 def test_tool_grasps_at_the_attachment_that_is_made_for_it() -> None:
-    scene, options = vkc.load_scene("fetch"), vkc.Options()
+    scene, options = load_scene("fetch"), vkc.Options()
     steps = [vkc.Grasp("stick"), vkc.Grasp("ball", by="stick.tip")]
     assert [hold.attachment for hold in compile_task(scene, steps, options).after] == [
         "grip",
@@ -157,7 +164,7 @@ def test_tool_grasps_at_the_attachment_that_is_made_for_it() -> None:
 def test_several_open_attachments_of_a_task_have_no_alternatives() -> None:
     """Each of them has been planned alone before."""
     steps = [PUT_DOWN, vkc.Actuate("dishwasher", DOOR_SHUT)]
-    task = compile_task(vkc.load_scene("household"), steps, vkc.Options())
+    task = compile_task(load_scene("household"), steps, vkc.Options())
     assert [(one.step, one.object) for one in task.open_attachments] == [
         (0, "cup"),
         (1, "dishwasher"),
@@ -171,7 +178,7 @@ def test_several_open_attachments_of_a_task_have_no_alternatives() -> None:
 
 def test_grasp_is_open_only_where_the_next_step_can_use_it() -> None:
     """The rack is pulled by its bar or its posts, not by the door's rail."""
-    scene = vkc.load_scene("household")
+    scene = load_scene("household")
     steps = [vkc.Grasp("dishwasher"), vkc.Actuate("dishwasher", {"rack": 0.3})]
     task = compile_task(scene, steps, vkc.Options())
     others = [label.partition(".")[2] for label, _ in generate_alternatives(task)]
@@ -179,7 +186,7 @@ def test_grasp_is_open_only_where_the_next_step_can_use_it() -> None:
 
 
 def test_object_is_grasped_again_at_another_attachment_unless_that_is_named() -> None:
-    held = vkc.load_scene("household").with_held({"cup": "side"})
+    held = load_scene("household").with_held({"cup": "side"})
     shapes = make_world_shapes(held.objects["cup"])
     lowest = min(compute_world_box(one.geometry, one.placement)[0][2] for one in shapes)
     x, y, _ = held.objects["cup"].placement.translation

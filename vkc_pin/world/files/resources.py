@@ -203,13 +203,12 @@ def _list_package_candidates(
     inside = inside.lstrip("/")
     if name in packages:
         yield packages[name] / inside
-    around = _list_folders_above(file)
-    for folder in around:
+    for folder in _iterate_folders_above(file):
         yield folder / name / inside
     if inside:
-        for folder in around:
+        for folder in _iterate_folders_above(file):
             yield folder / inside
-    for folder in around:
+    for folder in _iterate_folders_above(file):
         yield folder / "models" / name / inside
     for variable in _MODEL_PATHS:
         for model_folder in os.environ.get(variable, "").split(os.pathsep):
@@ -222,9 +221,14 @@ def _list_package_candidates(
             yield data / inside
 
 
-def _list_folders_above(file: Path) -> list[Path]:
-    """Return the folders around a file, and around its target if it is a link, from inside out."""
-    return list(dict.fromkeys([*file.absolute().parents, *file.resolve().parents]))
+def _iterate_folders_above(file: Path) -> Iterator[Path]:
+    """Yield the folders around a file, and around its target if it is a link, from inside out."""
+    own_folders = file.absolute().parents
+    yield from own_folders
+    # Links are followed only if none of these is wanted, since that reads all folders on the path.
+    for folder in file.resolve().parents:
+        if folder not in own_folders:
+            yield folder
 
 
 def find_package(
@@ -237,7 +241,7 @@ def find_package(
     """
     if packages and name in packages:
         return Path(packages[name])
-    around = _list_folders_above(file)
+    around = list(_iterate_folders_above(file))
     for folder in around:
         candidates = [folder / name]
         if folder.name == name:

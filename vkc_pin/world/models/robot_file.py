@@ -95,6 +95,9 @@ def find_robot(name: str | Path) -> Path:
                 expected="a URDF file, a robot.yaml, or a robot's name",
             )
         return file
+    own_file = resources.find_resource_folder("robots") / str(name) / "robot.yaml"
+    if resources.is_file(own_file):
+        return own_file
     known = list_robots()
     if name not in known:
         raise UnknownNameError("robot", str(name), known)

@@ -91,35 +91,57 @@ def compute_clearance(
         second: Other shapes, likewise.
         reach: Cutoff [m]: if all distances are larger, the result is some number ≥ `reach`.
     """
-    first_shapes = list(first)
-    second_shapes = list(second)
-    first_lower, first_upper = _compute_world_boxes(first_shapes)
-    second_lower, second_upper = _compute_world_boxes(second_shapes)
-    # Gaps between the boxes along the axes, shape (first, second, 3). The largest is a lower bound
-    # of the distance even if it is negative, since a translation by that amount separates the
-    # shapes.
-    gaps = np.maximum(second_lower - first_upper[:, None], first_lower[:, None] - second_upper)
-    bounds = gaps.max(axis=2)
-    pairs = np.argwhere(bounds < reach)
-    order = np.argsort(bounds[tuple(pairs.T)], kind="stable")
-    nearest = reach
-    for i, k in pairs[order].tolist():
-        if bounds[i, k] >= nearest:
-            break
-        distance = compute_shape_distance(*first_shapes[i], *second_shapes[k])
-        nearest = min(nearest, distance)
-    return nearest
+    return FixedShapes(second).compute_clearance(first, reach=reach)
+
+
+class FixedShapes:
+    """Shapes at fixed placements, whose boxes are computed once for several distances.
+
+    Args:
+        shapes: Shapes with their placements in the world frame.
+    """
+
+    def __init__(self, shapes: Iterable[tuple[coal.CollisionGeometry, pin.SE3]]) -> None:
+        self._shapes = list(shapes)
+        self._lower, self._upper = _compute_world_boxes(self._shapes)
+
+    def compute_clearance(
+        self, others: Iterable[tuple[coal.CollisionGeometry, pin.SE3]], *, reach: float = np.inf
+    ) -> float:
+        """Return the smallest signed distance to other shapes [m]; see `compute_clearance`."""
+        shapes = list(others)
+        lower, upper = _compute_world_boxes(shapes)
+        # Gaps between the boxes along the axes, shape (others, fixed shapes, 3). The largest is a
+        # lower bound of the distance even if it is negative, since a translation by that amount
+        # separates the shapes.
+        gaps = np.maximum(self._lower - upper[:, None], lower[:, None] - self._upper)
+        bounds = gaps.max(axis=2)
+        pairs = np.argwhere(bounds < reach)
+        order = np.argsort(bounds[tuple(pairs.T)], kind="stable")
+        nearest = reach
+        for i, k in pairs[order].tolist():
+            if bounds[i, k] >= nearest:
+                break
+            distance = compute_shape_distance(*shapes[i], *self._shapes[k])
+            nearest = min(nearest, distance)
+        return nearest
 
 
 def _compute_world_boxes(
     shapes: Sequence[tuple[coal.CollisionGeometry, pin.SE3]],
 ) -> tuple[Floats, Floats]:
     """Return the corners of the shapes' axis-aligned boxes, shape (n, 3) each [m]."""
-    corners = np.empty((2, len(shapes), 3))
+    centers = np.empty((len(shapes), 3))
+    half_extents = np.empty((len(shapes), 3))
+    rotations = np.empty((len(shapes), 3, 3))
     for k, (shape, placement) in enumerate(shapes):
-        corners[:, k] = compute_world_box(shape, placement)
-    lower, upper = corners
-    return lower, upper
+        shape.computeLocalAABB()
+        centers[k] = placement.act(np.asarray(shape.aabb_local.center(), float))
+        half_extents[k] = _get_half_extents(shape)
+        rotations[k] = placement.rotation
+    # A box with the half extents h and the rotation R reaches |R| h along the axes of the world.
+    extents = np.einsum("nij,nj->ni", np.abs(rotations), half_extents)
+    return centers - extents, centers + extents
 
 
 def compute_shape_distance(

@@ -26,7 +26,7 @@ from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.pickling import freeze
 from vkc_pin.world.models.articulated_object import Attachment
 from vkc_pin.world.models.robot import Robot
-from vkc_pin.world.models.shapes import clamp_to_limits, compute_clearance, list_placed_shapes
+from vkc_pin.world.models.shapes import FixedShapes, clamp_to_limits, list_placed_shapes
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 
 MAX_POSITION_DEVIATION = 0.02
@@ -429,6 +429,7 @@ def find_reversed_approaches(
     """Return the holds whose approach overlaps the object or the floor, unless reversed."""
     found = list[Hold]()
     hands = dict[float | None, Solids]()  # by opening
+    obstacles = dict[str, FixedShapes]()  # by object
     for hold in holds:
         placed = objects[hold.object]
         opening = robot.opening(placed.object.attachment(hold.attachment).opening)
@@ -440,9 +441,12 @@ def find_reversed_approaches(
             back = holder.link_placement(hold.link).inverse()
             shapes = list_placed_shapes(make_world_shapes(holder))
             hand = [(shape, back * where) for shape, where in shapes]
-        solids = [*list_placed_shapes(make_world_shapes(placed)), *floor]
         if hold.attachment in placed.reversed:
             continue
+        if hold.object not in obstacles:
+            own = list_placed_shapes(make_world_shapes(placed))
+            obstacles[hold.object] = FixedShapes([*own, *floor])
+        solids = obstacles[hold.object]
         if _is_approach_free(placed, hold.attachment, hand, solids):
             continue
         turned = placed.with_reversed(hold.attachment)
@@ -478,7 +482,9 @@ def warn_of_openings(
         warnings.warn(f"{where}: {text}", stacklevel=4)
 
 
-def _is_approach_free(placed: PlacedObject, attachment: str, hand: Solids, solids: Solids) -> bool:
+def _is_approach_free(
+    placed: PlacedObject, attachment: str, hand: Solids, solids: FixedShapes
+) -> bool:
     """Return whether the hand approaches an attachment without overlapping solids.
 
     `hand` is given in the tool frame.
@@ -492,7 +498,7 @@ def _is_approach_free(placed: PlacedObject, attachment: str, hand: Solids, solid
         for back in _APPROACH:
             at = tool * pin.SE3(np.eye(3), np.array([0.0, 0.0, -back]))
             swept += [(shape, at * local) for shape, local in hand]
-        if compute_clearance(swept, solids, reach=-_MAX_OVERLAP) >= -_MAX_OVERLAP:
+        if solids.compute_clearance(swept, reach=-_MAX_OVERLAP) >= -_MAX_OVERLAP:
             return True
     return False
 

@@ -120,3 +120,16 @@ def test_exports_state_the_velocity(moving_plan: vkc.Plan, tmp_path: Path) -> No
     names = message["joint_names"]
     first = dict(zip(names, message["points"][0]["velocities"], strict=True))
     assert first["elbow_joint"] == pytest.approx(0.1)
+
+
+def test_wheeled_motions_are_replanned_from_their_own_velocity() -> None:
+    """They slip by less than validation accepts."""
+    scene = load_door_scene().with_robot("husky_ur5e", base="differential")
+    x, y = scene.start[:2].tolist()
+    plan = vkc.plan(scene, [vkc.GoTo(x - 0.5, y + 0.5)])
+    assert plan.success
+    end = float(plan.trajectory.times[-1])
+    for time in np.linspace(0.2, 0.8, 7) * end:
+        assert plan.scene_at(time).start_velocity.any()
+    rest = vkc.replan(plan, 0.4 * end)
+    assert rest.success

@@ -13,6 +13,7 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError, UnknownNameError, format_value
 from vkc_pin.utils.arguments import check_coordinate, check_mapping, check_text
+from vkc_pin.utils.system import is_file
 from vkc_pin.world.files import resources
 from vkc_pin.world.files.documents import Document
 from vkc_pin.world.files.resources import check_path
@@ -96,7 +97,7 @@ def find_robot(name: str | Path) -> Path:
             )
         return file
     own_file = resources.find_resource_folder("robots") / str(name) / "robot.yaml"
-    if resources.is_file(own_file):
+    if is_file(own_file):
         return own_file
     known = list_robots()
     if name not in known:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -17,8 +16,10 @@ from vkc_pin.world.scene.joint_estimation import (
     DECISIVE,
     FEWEST_POSES,
     JointEstimate,
-    compute_information,
+    JointFit,
+    JointKind,
     estimate_joint,
+    fit_joint,
 )
 from vkc_pin.world.scene.measured_joints import find_axis
 from vkc_pin.world.scene.placed_object import PlacedObject
@@ -139,18 +140,21 @@ class JointObserver:
         if len(poses) < FEWEST_POSES:
             return None
         placements = [pose.placement for pose in poses]
-        noise: dict[str, Any] = {
-            "position_noise": self._position_noise,
-            "rotation_noise": self._rotation_noise,
-        }
         kind, axis, point = find_axis(there, joint)
-        known = compute_information(placements, kind, (axis, point), **noise)
-        # The estimate fits the other kind, too, for which most cycles have no time.
-        if known - compute_information(placements, kind, **noise) < DECISIVE:
+        described = self._fit(placements, kind, (axis, point)).information
+        free = self._fit(placements, kind)
+        # An estimate fits the other kind, too, for which most cycles have no time.
+        if described - free.information < DECISIVE and free.is_plausible:
             return None
         try:
-            estimate = estimate_joint(placements, **noise)
+            estimate = estimate_joint(
+                placements,
+                position_noise=self._position_noise,
+                rotation_noise=self._rotation_noise,
+            )
         except InputError:  # the link has moved too little
+            return None
+        if described - estimate.information[estimate.kind] < DECISIVE:
             return None
         name = f"{placed.name}.{joint}"
         is_other_kind = estimate.kind != kind
@@ -161,6 +165,20 @@ class JointObserver:
             reason = f"{name} is {_describe_difference(estimate, axis, point)} elsewhere"
         value = float(poses[0].state[names.index(joint)])
         return JointFinding(placed.name, joint, link, estimate, last, value, reason, is_other_kind)
+
+    def _fit(
+        self,
+        placements: list[pin.SE3],
+        kind: JointKind,
+        known: tuple[Floats, Floats] | None = None,
+    ) -> JointFit:
+        return fit_joint(
+            placements,
+            kind,
+            known,
+            position_noise=self._position_noise,
+            rotation_noise=self._rotation_noise,
+        )
 
     def _select_poses(self, there: PlacedObject, joint: str, link: str) -> list[_Pose]:
         """Return poses that tell a joint of an object.

@@ -19,7 +19,7 @@ _FIXED = "fixed"
 DECISIVE = 10.0
 """Difference of two BIC that counts as very strong evidence (Kass and Raftery, JASA 1995)."""
 _LARGEST_RADIUS = 2.0  # [m] of a hinge
-_DOUBT = 3.0  # standard deviations up to which a rotation may be there
+_DOUBT = 3.0  # standard deviations up to which a rotation may be there, or errors may be noise
 FEWEST_POSES = 4
 """Fewest poses that tell a joint."""
 # parameters that all poses share: placement of the link; direction and point of the axis
@@ -118,18 +118,37 @@ def estimate_joint(
     raise _make_refusal(data, "it may turn or slide")
 
 
-def compute_information(
+@dataclass(frozen=True)
+class JointFit:
+    """How well a kind of joint explains poses.
+
+    Attributes:
+        information: Bayesian information criterion.
+        misfit: (χ² - ν) / sqrt(2 ν) with ν degrees of freedom: by how many standard deviations the
+            errors are larger than noise.
+    """
+
+    information: float
+    misfit: float
+
+    @property
+    def is_plausible(self) -> bool:
+        """Whether the errors may be noise."""
+        return self.misfit <= _DOUBT
+
+
+def fit_joint(
     poses: Sequence[pin.SE3 | Sequence[float]],
     kind: JointKind,
     known: tuple[Floats, Floats] | None = None,
     *,
     position_noise: float = 0.001,
     rotation_noise: float = 0.005,
-) -> float:
-    """Return the Bayesian information criterion of a kind of joint.
+) -> JointFit:
+    """Fit one kind of joint to poses.
 
-    If that of a known axis exceeds that of any axis by `DECISIVE`, the axis is very probably
-    elsewhere.
+    If the information of a known axis exceeds that of any axis by `DECISIVE`, the axis is very
+    probably elsewhere.
 
     Args:
         poses: See `estimate_joint`.
@@ -143,7 +162,8 @@ def compute_information(
         InputError: A pose is invalid, or there are less than four.
     """
     data = _make_data(poses, position_noise, rotation_noise)
-    return _Fit(kind, data, known).information
+    fit = _Fit(kind, data, known)
+    return JointFit(fit.information, fit.misfit)
 
 
 def _make_data(
@@ -253,7 +273,10 @@ class _Fit:
         self._minimize()
         # With n values and k parameters, BIC = χ² + k log n, up to a constant.
         count = self._size + len(positions) - 1
-        self.information = self._compute_cost(self._joint) + count * np.log(data.size)
+        cost = self._compute_cost(self._joint)
+        self.information = cost + count * np.log(data.size)
+        freedoms = data.size - count
+        self.misfit = float((cost - freedoms) / np.sqrt(2.0 * freedoms))
 
     @property
     def positions(self) -> Floats:

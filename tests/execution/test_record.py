@@ -10,7 +10,7 @@ import pytest
 
 import vkc_pin as vkc
 from docs.pictures.closed_loop import execute_with_passer_by
-from vkc_pin.execution import ExecutionResult
+from vkc_pin.execution import Cycle, ExecutionResult
 
 
 @cache
@@ -53,3 +53,20 @@ def test_execution_is_shown(tmp_path: Path) -> None:
     result.plot(tmp_path / "plot.png")
     assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
     assert isinstance(result.executed, vkc.Plan)
+
+
+def test_motion_jumps_to_where_the_robot_was_measured() -> None:
+    """A motion that is planned from a measured state begins beside the one before."""
+    plan = vkc.plan(vkc.load_scene("door"), [vkc.Configure({"base_x": -0.5})])
+    takeover = 0.4 * float(plan.trajectory.times[-1])
+    measured = plan.scene_at(takeover).start + np.array([0.01, *np.zeros(8)])
+    rest = vkc.replan(plan, takeover, state=measured)
+    assert plan.success
+    assert rest.success
+    end = takeover + float(rest.trajectory.times[-1])
+    cycle = Cycle(end, float(rest.trajectory.times[-1]), 0.01, "go on", "")
+    result = ExecutionResult(plan, True, "", (cycle,), ((0.0, plan), (takeover, rest)), 0)
+    motion = result.motion
+    np.testing.assert_allclose(motion.at(takeover)[:9], plan.trajectory.at(takeover)[:9], atol=1e-9)
+    np.testing.assert_allclose(motion.at(takeover + 1e-3)[:9], measured, atol=1e-9)
+    assert motion.times[-1] == pytest.approx(end, abs=2e-3)

@@ -11,7 +11,7 @@ import numpy as np
 
 from vkc_pin.planning.plan import Plan
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
-from vkc_pin.world.trajectory.splicing import concatenate_trajectories, extract_times
+from vkc_pin.world.trajectory.splicing import MAX_GAP, concatenate_trajectories, extract_times
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
 
@@ -24,6 +24,7 @@ is found yet; or giving up."""
 
 
 _SHORTEST = 1e-6  # [s] of a part of a motion
+_JUMP = 1e-3  # [s] of a jump to the measured state
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,11 @@ class ExecutionResult:
 
     @property
     def motion(self) -> Trajectory:
-        """The motion that was sent in all, up to the last cycle; it counts from its begin."""
+        """The motion that was sent in all, up to the last cycle; it counts from its begin.
+
+        Where a motion begins at the measured state, beside the one before, it jumps there within a
+        millisecond.
+        """
         parts = list[Trajectory]()
         ends = [begin for begin, _ in self.plans[1:]]
         ends.append(self.cycles[-1].time if self.cycles else np.inf)
@@ -93,7 +98,10 @@ class ExecutionResult:
             first = float(whole.times[0])
             last = min(first + end - begin, float(whole.times[-1]))
             if last - first > _SHORTEST:
-                parts.append(extract_times(whole, first, last))
+                part = extract_times(whole, first, last)
+                if parts and _is_beside(parts[-1], part):
+                    parts.append(_jump(parts[-1], part))
+                parts.append(part)
             rest = end - begin - (last - first)
             if parts and np.isfinite(rest) and rest > _SHORTEST:
                 parts.append(_stand(parts[-1], rest))
@@ -152,6 +160,22 @@ class ExecutionResult:
             axes.set_ylabel("latency [ms]")
             axes.legend(loc="upper right")
         return save_figure(figure, path)
+
+
+def _is_beside(before: Trajectory, after: Trajectory) -> bool:
+    """Return whether a motion of the robot does not begin where another ends."""
+    size = before.robot_size
+    gap = after.positions[0, :size] - before.positions[-1, :size]
+    return bool(np.abs(gap).max() > MAX_GAP)
+
+
+def _jump(before: Trajectory, after: Trajectory) -> Trajectory:
+    """Return a motion of the robot from where one ends to where another begins."""
+    size = before.robot_size
+    positions = np.array([before.positions[-1, :size], after.positions[0, :size]])
+    phase = after.phases[0]
+    span = PhaseSpan(phase.name, 0, 1, phase.holds, phase.opening)
+    return Trajectory(before.names[:size], np.array([0.0, _JUMP]), positions, (span,), size)
 
 
 def _stand(before: Trajectory, duration: float) -> Trajectory:

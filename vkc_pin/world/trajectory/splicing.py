@@ -14,7 +14,7 @@ from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 _SHORTEST = 10.0 * MIN_INTERVAL  # [s] between two knots
-_MAX_GAP = 1e-6  # [m], [rad] between the end of a motion and the begin of the next
+MAX_GAP = 1e-6  # [m], [rad] between the end of a motion and the begin of the next
 
 
 def concatenate_trajectories(parts: Sequence[Trajectory], *, pause: float) -> Trajectory:
@@ -38,7 +38,7 @@ def concatenate_trajectories(parts: Sequence[Trajectory], *, pause: float) -> Tr
         if number:
             distances = np.abs(part.positions[0, :robot] - waypoints.last(part.names[:robot]))
             largest = distances.max()
-            if not largest <= _MAX_GAP:
+            if not largest <= MAX_GAP:
                 problem = "a motion does not begin where the one before it ends"
                 got = f"{largest:g} apart"
                 raise InputError(problem, field=f"parts[{number}]", got=got)

@@ -450,7 +450,7 @@ def test_messages_with_other_times_than_phases_are_rejected(
         for point, time in zip(message["points"], changed.tolist(), strict=True):
             sec, nanosec = divmod(round(time * 1e9), 10**9)
             point["time_from_start"] = {"sec": sec, "nanosec": nanosec}
-    expected = f"points: there are no points at the times.*{motion.times[-1]:.2f}"
+    expected = f"points: there are no points at the times.*{motion.times[-1]:.3f}"
     with expect_error(expected):
         vkc.Trajectory.from_ros(message, like=motion)
     file = write_text_file(tmp_path / "sent.json", json.dumps(message))

@@ -11,6 +11,7 @@ from vkc_pin import UnknownNameError
 from vkc_pin.world.files.resources import (
     choose_file_names,
     find_file,
+    find_mesh_file,
     find_resource,
     find_resource_folder,
     list_resources,
@@ -21,6 +22,19 @@ def test_files_are_found_by_name_or_path() -> None:
     door = find_resource("scenes", "*.yaml", "door", noun="scene")
     for name, found in (("door", door), ("a/b", "a/b"), ("b.yaml", "b.yaml"), (Path("b"), "b")):
         assert find_file(name, "scenes", "*.yaml", noun="scene") == Path(found)
+
+
+@pytest.mark.parametrize("address", ["package://robot/part.stl", "package://other/part.stl"])
+def test_packages_are_found_around_the_target_of_a_link(tmp_path: Path, address: str) -> None:
+    """A link to a description stands apart from its meshes."""
+    package = tmp_path / "deep" / "robot"
+    package.mkdir(parents=True)
+    (package / "part.stl").touch()
+    (package / "robot.urdf").touch()
+    link = tmp_path / "links" / "robot.urdf"
+    link.parent.mkdir()
+    link.symlink_to(package / "robot.urdf")
+    assert find_mesh_file(address, link) == package / "part.stl"
 
 
 def test_unknown_resources_raise() -> None:

@@ -13,7 +13,7 @@ from vkc_pin.execution import ExecutionResult, IdealRobot, execute
 _SPEED = 0.8  # of the person [m/s]
 
 
-def execute_with_passer_by() -> ExecutionResult:
+def execute_beside_person() -> ExecutionResult:
     """Execute the plan of a door while a cylinder crosses its path."""
     scene = vkc.load_scene("door")
     plan = vkc.plan(scene, [vkc.Actuate("door", {"hinge": 1.2})])
@@ -29,4 +29,4 @@ def execute_with_passer_by() -> ExecutionResult:
 
 def make() -> None:
     """Write the picture."""
-    execute_with_passer_by().plot(IMAGES / "closed_loop.png")
+    execute_beside_person().plot(IMAGES / "closed_loop.png")

@@ -139,7 +139,7 @@ class PullingRobot(IdealRobot):
 
 @pytest.mark.parametrize("sees", [False, True])
 def test_limit_of_force_ends_a_pull(sees: bool) -> None:
-    """With or without a camera: the drawer is where it should be, and does not give way."""
+    """With or without a camera: the drawer is where it should be, and does not move."""
     plan = plan_drawer()
     robot = PullingRobot(plan.scene, is_simulated=True)
     options: dict[str, Any] = {"observe_link": lambda *_: None} if sees else {}

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import vkc_pin as vkc
-from docs.pictures.closed_loop import execute_with_passer_by
+from docs.pictures.closed_loop import execute_beside_person
 from vkc_pin.execution import Cycle, ExecutionResult
 
 
 @cache
 def execute_beside_a_person() -> ExecutionResult:
-    result = execute_with_passer_by()
+    result = execute_beside_person()
     assert result.success, result.summary()
     return result
 

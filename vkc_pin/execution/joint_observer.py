@@ -186,14 +186,14 @@ class JointObserver:
         They are those in which the object's other joints displace the link by less than the noise,
         compared with the object as it is now, and this displacement is taken from them.
         """
-        parent_now, link_now = _place_around(there, joint, link, there.state)
+        parent_now, link_now = _compute_neighbour_placements(there, joint, link, there.state)
         index = there.object.coordinates.index(joint)
         known: dict[bytes, tuple[pin.SE3, pin.SE3]] = {}  # by the values of the other joints
         found = list[_Pose]()
         for pose in self._poses:
             others = np.delete(pose.state, index).tobytes()
             if others not in known:
-                known[others] = _place_around(there, joint, link, pose.state)
+                known[others] = _compute_neighbour_placements(there, joint, link, pose.state)
             parent, local = known[others]
             behind = local.actInv(link_now)
             before = parent_now.actInv(parent)
@@ -211,7 +211,7 @@ class JointObserver:
         return distance <= self._position_noise and angle <= self._rotation_noise
 
 
-def _place_around(
+def _compute_neighbour_placements(
     placed: PlacedObject, joint: str, link: str, state: Floats
 ) -> tuple[pin.SE3, pin.SE3]:
     """Return the placements of a joint's parent in the world, and of a link in the joint's body.

@@ -59,7 +59,7 @@ def execute(  # noqa: PLR0913 - keyword options of a public call
     new motion is found in time, the robot brakes on its path, and plans from rest.
 
     While the hand moves a joint of a fixed object, the joint is estimated from poses of the grasped
-    link. If the estimate is decisively better than what the plan assumes, the rest is planned again
+    link. If the estimate is decisively better than the joint of the plan, the rest is planned again
     with it, and the grasp stays as it is. A force or torque beyond its limit ends the pull: the
     robot stops at once, and goes on if the joint is found to be elsewhere.
 
@@ -85,7 +85,7 @@ def execute(  # noqa: PLR0913 - keyword options of a public call
 
     Raises:
         InputError: The plan is no success or ends in motion, the robot is not at its start or does
-            not measure what is limited, or an argument is invalid.
+            not measure a limited load, or an argument is invalid.
     """
     check_instance(plan, Plan, "plan").check_success()
     if plan.ends_in_motion:
@@ -414,7 +414,7 @@ class _Loop:
             self._robot.stop()  # commands that are off the mechanism pull at rest, too
             self._is_released = True
             return "wait", self._pull
-        if self._pull and self._joint is None and not self._has_advanced():
+        if self._pull and self._joint is None and not self._has_moved_on():
             decision: Decision = "stop" if self._settings.observer is None else "wait"
             return decision, self._pull
         end = float(self._plan.trajectory.times[-1])
@@ -453,10 +453,10 @@ class _Loop:
             self._pulled_to = found.scene.start
         return "replan", "from rest"
 
-    def _has_advanced(self) -> bool:
-        """Return whether the mechanism has given way since the pull before.
+    def _has_moved_on(self) -> bool:
+        """Return whether the mechanism has moved since the pull before.
 
-        Then what is left of the joint's error is too small to be known, and only adds up.
+        Then the rest of the joint's error is too small to be estimated, and only adds up.
         """
         if self._settings.observer is None or self._pulled_to is None:
             return False

@@ -99,7 +99,7 @@ class ExecutionResult:
             last = min(first + end - begin, float(whole.times[-1]))
             if last - first > _SHORTEST:
                 part = extract_times(whole, first, last)
-                if parts and _is_beside(parts[-1], part):
+                if parts and _has_gap(parts[-1], part):
                     parts.append(_jump(parts[-1], part))
                 parts.append(part)
             rest = end - begin - (last - first)
@@ -162,7 +162,7 @@ class ExecutionResult:
         return save_figure(figure, path)
 
 
-def _is_beside(before: Trajectory, after: Trajectory) -> bool:
+def _has_gap(before: Trajectory, after: Trajectory) -> bool:
     """Return whether a motion of the robot does not begin where another ends."""
     size = before.robot_size
     gap = after.positions[0, :size] - before.positions[-1, :size]

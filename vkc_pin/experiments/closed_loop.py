@@ -75,7 +75,7 @@ _DEEPEST = 1e-3  # [m] of collisions that count as none
 _AXIS_SHIFT = 0.03  # [m]
 _AXIS_TURN = np.radians(5.0)
 _LINK_NOISE = (0.001, float(np.radians(0.3)))  # of a camera: position [m] and rotation [rad]
-# Limits of a pull: a third of what breaks a grasp, and three times what an undisturbed one takes
+# Limits of a pull: a third of the load that breaks a grasp, three times that of an undisturbed one
 _FORCE_LIMIT = 93.0  # [N]
 _TORQUE_LIMIT = 10.0  # [N·m]
 

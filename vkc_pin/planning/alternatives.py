@@ -18,7 +18,7 @@ from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.phases import Task
 from vkc_pin.world.task.steps import Step
 
-PlanApart = Callable[[Scene, Task, PlanningRequest], Schedule[TaskResult]]
+PlanStepByStep = Callable[[Scene, Task, PlanningRequest], Schedule[TaskResult]]
 """Plans the steps of a task one after the other."""
 
 
@@ -28,7 +28,7 @@ def solve_with_alternatives(
     requests: Sequence[PlanningRequest],
     *,
     named: Collection[str] = (),
-    plan_apart: PlanApart | None = None,
+    plan_step_by_step: PlanStepByStep | None = None,
 ) -> Schedule[TaskResult]:
     """Solve a task; if that fails, with each of the other attachments that its steps leave open.
 
@@ -42,22 +42,23 @@ def solve_with_alternatives(
         task: The task.
         requests: Arguments of planning, tried in turn; see `schedule.solve`.
         named: Objects that are held at attachments that the user has named.
-        plan_apart: Plans an alternative whose holds cannot be in one chain, as where an object is
-            grasped anew whose measured grasp deviates. None: the result must be one problem with
-            as many steps. Otherwise a grasped object that cannot be moved with its present grasp is
-            released and grasped anew, and the search for the task itself may pause.
+        plan_step_by_step: Plans an alternative whose holds cannot be in one chain, as where an
+            object is grasped anew whose measured grasp deviates. None: the result must be one
+            problem with as many steps. Otherwise a grasped object that cannot be moved with its
+            present grasp is released and grasped anew, and the search for the task itself may
+            pause.
 
     Returns:
         The first success, whose steps name the attachment unless it is the default; if all fail,
         the result of the task itself, with notes on the others. Its status is "infeasible" only if
         that holds for all.
     """
-    may_regrasp = plan_apart is not None
+    may_regrasp = plan_step_by_step is not None
     alternatives = functools.cache(
         lambda: tuple(_generate_steps(scene, task, requests[0], named, may_regrasp=may_regrasp))
     )
     first: TaskResult | None
-    pauses = plan_apart is not None and len(task.open_attachments) == 1
+    pauses = plan_step_by_step is not None and len(task.open_attachments) == 1
     search = TaskSearch(scene, task, requests[0], pauses=pauses)
     with share_budget(lambda: 1 + len(alternatives())):
         if pauses:
@@ -73,7 +74,7 @@ def solve_with_alternatives(
             break
         try:
             with share_budget(len(alternatives()) - number):
-                other = yield from _solve_steps(scene, steps, requests, plan_apart)
+                other = yield from _solve_steps(scene, steps, requests, plan_step_by_step)
         except InputError as error:
             notes.append(f"at {name}: {error}")
             continue
@@ -110,7 +111,7 @@ def _solve_steps(
     scene: Scene,
     steps: Sequence[Step],
     requests: Sequence[PlanningRequest],
-    plan_apart: PlanApart | None,
+    plan_step_by_step: PlanStepByStep | None,
 ) -> Schedule[TaskResult]:
     """Solve the steps of an alternative.
 
@@ -120,9 +121,9 @@ def _solve_steps(
     task = compile_task(scene, steps, requests[0].options)
     if find_shared_coordinate(scene, task.holds) is None:
         return (yield from solve(scene, task, requests, check_goals_first=True))
-    if plan_apart is None:
+    if plan_step_by_step is None:
         raise InputError("its grasps cannot be part of one problem")
-    return (yield from plan_apart(scene, task, requests[0]))
+    return (yield from plan_step_by_step(scene, task, requests[0]))
 
 
 def _combine_failures(

@@ -61,7 +61,7 @@ class PlanningRequest:
         effort: Factor of the collision checks of searches with trees; see `plan`.
         is_tentative: Whether planning gives up if the goals of its first initial guess seem to be
             blocked, as steps before can be planned again with another grasp.
-        log: What the searches of the call have done; requests derived from this one share it.
+        log: Statistics and history of the call's searches; requests derived from this one share it.
     """
 
     initialization: str

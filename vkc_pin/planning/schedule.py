@@ -1,7 +1,7 @@
-"""Carries out schedules, which decide what a planning call searches for next.
+"""Carries out schedules, which decide the next search of a planning call.
 
 A schedule is a generator: it yields searches, is sent their results, and returns its own. So each
-way of planning is written down as a sequence of searches, and schedules are composed with
+mode of planning is written down as a sequence of searches, and schedules are composed with
 `yield from`, while one loop runs all searches: `carry_out`.
 """
 
@@ -25,7 +25,7 @@ Schedule = Generator[TaskSearch, TaskResult | None, T]
 def carry_out(schedule: Schedule[T]) -> T:
     """Run every search that a schedule yields; return the schedule's result.
 
-    What a search raises is raised where the schedule waits for its result: there it may be caught,
+    An error in a search is raised where the schedule waits for its result: there it may be caught,
     and tracebacks contain how the schedule came there.
     """
     try:

@@ -64,7 +64,9 @@ def plan_as_one(scene: Scene, task: Task, request: PlanningRequest) -> Schedule[
     searched if a step fails; with other initializations they come first.
     """
     if len(task.steps) == 1:
-        result = yield from solve_with_alternatives(scene, task, [request], plan_apart=_plan_apart)
+        result = yield from solve_with_alternatives(
+            scene, task, [request], plan_step_by_step=_plan_step_by_step
+        )
         return result.plan
     is_auto = request.initialization == "auto"
     order = (_plan_from_steps, _plan_from_guesses)
@@ -92,7 +94,9 @@ def _plan_from_guesses(
     Returns:
         The plan, and whether planning from steps would fail, too.
     """
-    result = yield from solve_with_alternatives(scene, task, [request], plan_apart=_plan_apart)
+    result = yield from solve_with_alternatives(
+        scene, task, [request], plan_step_by_step=_plan_step_by_step
+    )
     plan = result.plan
     return plan, plan.status == "infeasible" and len(task.open_attachments) <= 1
 
@@ -148,7 +152,7 @@ def _list_steps(task: Task, parts: Sequence[PlannedStep]) -> tuple[Step, ...]:
     return tuple(steps)
 
 
-def _plan_apart(scene: Scene, task: Task, request: PlanningRequest) -> Schedule[TaskResult]:
+def _plan_step_by_step(scene: Scene, task: Task, request: PlanningRequest) -> Schedule[TaskResult]:
     """Plan an alternative of a step or of several step by step; see `solve_with_alternatives`."""
     request = dataclasses.replace(request, wants_draft=False)
     parts = yield from plan_each_step(scene, task, request)
@@ -182,7 +186,7 @@ def plan_each_step(
         is_tentative = request.wants_draft and has_chosen_grasp
         trial = dataclasses.replace(request, is_tentative=is_tentative)
         result = yield from solve_with_alternatives(
-            current, own, [trial], named=named, plan_apart=_plan_apart
+            current, own, [trial], named=named, plan_step_by_step=_plan_step_by_step
         )
         part = PlannedStep(number, number, result, _list_open_objects(own))
         can_join = request.wants_draft and parts and not result.is_solved
@@ -229,7 +233,9 @@ def _join_steps(
     is_chain = find_shared_coordinate(scene, joint.holds) is None
     if len(steps) == len(task.steps) or not is_chain or current_ending():
         return None
-    result = yield from solve_with_alternatives(scene, joint, [request], plan_apart=_plan_apart)
+    result = yield from solve_with_alternatives(
+        scene, joint, [request], plan_step_by_step=_plan_step_by_step
+    )
     return PlannedStep(begin.first, failed.last, result, _list_open_objects(joint))
 
 

@@ -284,7 +284,7 @@ class TaskSearch:
                 yield guess
 
     def _choose_attempt(self, problem: TrajectoryProblem) -> _Attempt | None:
-        """Return what is tried next; None if no further guess is worth trying."""
+        """Return the next guess to try; None if no further one is worth trying."""
         if self._refined is not None:
             attempt = self._refined
             self._refined = None

@@ -140,7 +140,7 @@ class _SlidingWindow:
         self._ahead = self._ahead[: last - first]
         failed = None
         while failed is None and first + len(self._ahead) < last and not current_ending():
-            failed = yield from self._look_ahead()
+            failed = yield from self._plan_next_action()
         if current_ending():
             return failed
         scene = self._current_scene
@@ -184,7 +184,7 @@ class _SlidingWindow:
             last += 1
         return last
 
-    def _look_ahead(self) -> Schedule[Plan | None]:
+    def _plan_next_action(self) -> Schedule[Plan | None]:
         """Plan one more action alone, from the end of those ahead; return its plan if it fails.
 
         After a failure other attachments are tried; the first success determines the attachment.

@@ -63,7 +63,7 @@ def get_vertices(part: Part) -> np.ndarray:
 
 
 def measure_distance(one: np.ndarray, other: np.ndarray) -> float:
-    """Return the largest distance of a point of one set from the other, both ways."""
+    """Return the Hausdorff distance of two sets of points."""
     distances = np.linalg.norm(one[:, None] - other[None], axis=-1)
     return float(max(distances.min(axis=0).max(), distances.min(axis=1).max()))
 

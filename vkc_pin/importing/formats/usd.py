@@ -711,7 +711,7 @@ class _Reader:
         if body.mass.mass is not None:
             mass = body.mass.mass * self._stage.kilograms
             if not parts:
-                # The shape of the mass is that of what is seen.
+                # The mass has the shape of the visual geometry.
                 for part in visual:
                     total += _compute_inertia(part, _DENSITY)
             total = _scale_mass(total, mass)

@@ -66,7 +66,7 @@ _OPACITY_INPUTS = ("opacity", "opacity_constant")
 
 @dataclass(frozen=True, eq=False)
 class UsdMass:
-    """What a prim states about its mass; None where it states nothing.
+    """The mass properties that a prim states; None where it states nothing.
 
     Attributes:
         mass: Mass.
@@ -116,7 +116,7 @@ class UsdShape:
         is_visual: Whether it is rendered.
         collides: Whether it collides.
         approximation: How a mesh collides, as in `UsdPhysics.MeshCollisionAPI`.
-        mass: What it states about its mass as a collider.
+        mass: The mass properties that it states as a collider.
         material_density: Density of its physical material.
     """
 
@@ -137,7 +137,7 @@ class UsdShape:
 
 @dataclass(frozen=True, eq=False)
 class UsdBody:
-    """A rigid body: its path, frame in the stage, shape (4, 4), and what it states about mass."""
+    """A rigid body: its path, its frame in the stage, shape (4, 4), and stated mass properties."""
 
     path: str
     matrix: Floats
@@ -339,7 +339,7 @@ def _name_layer(layer: Any) -> str:
 
 
 def _find_message(error: Exception) -> str:
-    """Return the message of an error of usd-core, in one line; it may quote what is no text."""
+    """Return the message of an error of usd-core in one line; quoted bytes may be no text."""
     try:
         text = str(error)
     except UnicodeDecodeError as other:
@@ -528,7 +528,7 @@ class _Reader:
         return None
 
     def _read_mass(self, prim: Any) -> UsdMass:
-        """Return what a prim states about its mass; the schema's defaults state nothing."""
+        """Return the mass properties that a prim states; the schema's defaults state nothing."""
         from pxr import UsdPhysics
 
         if not prim.HasAPI(UsdPhysics.MassAPI):
@@ -621,7 +621,7 @@ class _Reader:
         return "none"
 
     def _read_collider_mass(self, prim: Any, collider: Any) -> UsdMass:
-        """Return what a collider that is not the body itself states about its mass."""
+        """Return the mass properties of a collider that is not the body itself."""
         for stated in (prim, collider):
             if str(stated.GetPath()) not in self._bodies:
                 mass = self._read_mass(stated)

@@ -453,7 +453,7 @@ class _Sweep:
         self._states = np.column_stack(list(states.values()))
 
     def find_obstacles(self, label: str) -> list[str]:
-        """Return what a link passes by closely, in the order of names."""
+        """Return the links that a link passes by closely, in the order of names."""
         near = self._shapes.find_links_near_sweep(label, self._index, self._values)
         return sorted(self._others & near)
 

@@ -168,6 +168,25 @@ def test_displaced_door_is_opened_from_the_middle_of_the_motion() -> None:
     assert found.scene.objects["door"].placement == moved
 
 
+@pytest.mark.parametrize("shift", [(0.05, 0.0), (-0.02, 0.045), (-0.033, -0.038)])
+def test_fast_robot_goes_on_to_a_displaced_drawer_without_a_stop(
+    shift: tuple[float, float],
+) -> None:
+    plan = vkc.plan(vkc.load_scene("drawer"), [vkc.Actuate("drawer", {"slide": 0.3})])
+    now = plan.scene_at(1.4)
+    limits = now.robot.velocity
+    assert np.abs(now.start_velocity / limits).max() > 0.95
+    moved = now.objects["drawer"].placement.copy()
+    moved.translation[:2] += shift
+    found = vkc.replan(plan, 1.4, scene=now.with_placement("drawer", moved), time_limit=30.0)
+    assert found.success, found.summary()
+    reached = found.trajectory.times[found.trajectory.phases[0].last]
+    velocities = found.trajectory.velocity(np.linspace(0.0, 0.8 * reached, 100))[:, : len(limits)]
+    assert np.abs(velocities / limits).max(axis=1).min() > 0.2
+    rest = plan.trajectory.times[-1] - 1.4
+    assert found.trajectory.times[-1] < 1.1 * rest
+
+
 def test_measured_state_is_where_the_new_motion_begins() -> None:
     plan = plan_door()
     state = plan.trajectory.at(1.0)[:9] + 0.01

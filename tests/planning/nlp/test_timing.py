@@ -102,6 +102,19 @@ def test_stretched_steps_keep_the_velocities_at_the_ends(seed: int) -> None:
         assert compute_excess(0.999 * stretched) > 0.0
 
 
+@pytest.mark.parametrize("velocity", [-0.3, 0.2])
+def test_strongest_steps_at_moving_ends_are_parabolas(velocity: float) -> None:
+    """From a velocity v, the acceleration a leads to v·dt + a·dt²/2 in a step."""
+    dt, limit = 0.1, 2.0
+    limits, velocities = (np.full(1, 1e3), np.full(1, limit)), np.full((2, 1), velocity)
+    timing = Timing(np.full(2, dt), np.full(2, dt), [(0, 2)], limits, velocities)
+    strongest = np.full((2, 1), velocity * dt + limit * dt**2 / 2.0)
+    outer = np.vstack([velocities[:1] * dt, strongest, velocities[1:] * dt])
+    assert timing.compute_violation(strongest, np.diff(outer, axis=0)) == pytest.approx(0.0)
+    at_rest = Timing(np.full(2, dt), np.full(2, dt), [(0, 2)], limits, np.zeros((2, 1)))
+    assert at_rest.acceleration[:, 0] == pytest.approx(np.full(3, limit * dt**2))
+
+
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_cubic_with_velocities_at_its_ends_keeps_the_limits(seed: int) -> None:

@@ -44,10 +44,18 @@ class Timing:
 
     @cached_property
     def acceleration(self) -> Floats:
-        """Bounds of the changes δδz, shape (N + 1 + stops, n): acceleration limits times dt²."""
+        """Bounds of the changes δδz, shape (N + 1 + stops, n): acceleration limits times dt².
+
+        A step has its mean velocity in its middle. Between two steps dt passes, but only half of it
+        between a step and an end in motion.
+        """
         runs = [np.full(last - first + 1, self.dt[first]) for first, last in self.runs]
         row_durations = np.concatenate(runs)
-        return np.asarray(self.limits[1] * row_durations[:, None] ** 2)
+        bounds = np.asarray(self.limits[1] * row_durations[:, None] ** 2)
+        for end, velocity in zip((0, -1), self.end_velocities, strict=True):
+            if velocity.any():
+                bounds[end] /= 2.0
+        return bounds
 
     def compute_violation(
         self, first: Floats, second: Floats, needed: Floats | float = 0.0

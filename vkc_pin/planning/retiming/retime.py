@@ -12,7 +12,7 @@ from vkc_pin.planning.base_paths.arcs import interpolate_arcs
 from vkc_pin.planning.retiming.braking import make_accelerating_curve, make_braking_curve
 from vkc_pin.planning.retiming.cubic_path import CubicPath
 from vkc_pin.planning.retiming.limits import Limits, limit_jerk
-from vkc_pin.planning.retiming.spline_path import fit_path
+from vkc_pin.planning.retiming.spline_path import fit_path, fit_path_at
 from vkc_pin.planning.retiming.topp_ra import PathSamples, compute_speeds
 from vkc_pin.planning.retiming.torque_bounds import TorqueBounds
 from vkc_pin.planning.retiming.wheeled_paths import compute_slip, fit_rolling_paths
@@ -104,6 +104,7 @@ def retime_trajectory(
     torques = Torques(scene, trajectory)
     waypoint_before = np.searchsorted(waypoints, np.arange(waypoints[-1]), side="right") - 1
     phases = torques.phases_of(waypoint_before)
+    planned_times = np.interp(np.arange(waypoints[-1] + 1), waypoints, trajectory.times)
 
     pieces = list[Curve]()
     point_knots = [0]  # indices of all points among the knots of the curve
@@ -120,7 +121,14 @@ def retime_trajectory(
             velocities[1] = end_velocities[1]
         if velocities.any():
             curves = _follow_between_velocities(
-                points, velocities, limits, scale, rolling, torque_bounds, np.array(least)
+                points,
+                planned_times[first : last + 1],
+                velocities,
+                limits,
+                scale,
+                rolling,
+                torque_bounds,
+                np.array(least),
             )
         elif is_still[first]:
             curves = [_stop_at_waypoints(points, limits, np.array(least))]
@@ -184,6 +192,7 @@ def _split_into_runs(is_stop: Bools) -> Iterator[tuple[int, int]]:
 
 def _follow_between_velocities(
     points: Floats,
+    planned_times: Floats,
     velocities: Floats,
     limits: Limits,
     scale: Floats,
@@ -199,7 +208,9 @@ def _follow_between_velocities(
     `least` are the durations [s] of steps without motion, shape (m − 1,).
     """
     if rolling.is_omnidirectional and limits.has_unlimited_jerk:
-        result = _retime_between_velocities(points, velocities, limits, scale, torque_bounds)
+        result = _retime_between_velocities(
+            points, planned_times, velocities, limits, scale, torque_bounds
+        )
         if result is not None:
             return [result]
     points = points.copy()
@@ -228,6 +239,7 @@ def _follow_between_velocities(
 
 def _retime_between_velocities(
     points: Floats,
+    planned_times: Floats,
     velocities: Floats,
     limits: Limits,
     scale: Floats,
@@ -240,27 +252,35 @@ def _retime_between_velocities(
     their accelerations q″w² at the end are smaller, since coordinates that do not move there yet
     have more time to follow.
 
+    If none has a timing, the path over the planned times, shape (m,), is followed: at their pace,
+    the program has kept the limits.
+
     Returns:
         The curve and the knots of the waypoints, or None if no path has a timing.
     """
     lengths = np.linalg.norm(np.diff(points, axis=0) * scale, axis=1)
     if (lengths <= _MIN_STEP_DURATION).any():
         return None
+    arc_lengths = np.concatenate([[0.0], np.cumsum(lengths)])
     speeds = np.linalg.norm(velocities * scale, axis=1)
-    curves = []
-    for ratio in _END_SPEED_RATIOS:
-        first_speed, last_speed = (ratio * speeds).tolist()
-        first_slope = velocities[0] / first_speed if first_speed > 0.0 else None
-        last_slope = velocities[1] / last_speed if last_speed > 0.0 else None
-        path = fit_path(points, scale, (limits.lower, limits.upper), (first_slope, last_slope))
-        curve = _follow_between_speeds(
-            path, len(points) - 1, velocities, (first_speed, last_speed), limits, torque_bounds
-        )
-        if curve is not None:
-            curves.append(curve)
-    if not curves:
-        return None
-    fastest = min(curves, key=lambda curve: float(curve.times[-1]))
+    bounds = (limits.lower, limits.upper)
+
+    def follow(positions: Floats, end_speeds: Floats) -> Curve | None:
+        first, last = end_speeds.tolist()
+        first_slope = velocities[0] / first if first > 0.0 else None
+        last_slope = velocities[1] / last if last > 0.0 else None
+        path = fit_path_at(positions, points, bounds, (first_slope, last_slope))
+        steps = len(points) - 1
+        return _follow_between_speeds(path, steps, velocities, (first, last), limits, torque_bounds)
+
+    curves = [follow(arc_lengths, ratio * speeds) for ratio in _END_SPEED_RATIOS]
+    found = [curve for curve in curves if curve is not None]
+    if not found:
+        planned = follow(planned_times, np.where(speeds > 0.0, 1.0, 0.0))
+        if planned is None:
+            return None
+        found = [planned]
+    fastest = min(found, key=lambda curve: float(curve.times[-1]))
     return _pass_through(points, fastest)
 
 
@@ -278,12 +298,13 @@ def _follow_between_speeds(
     exceed limits between the positions of TOPP-RA, that gets tighter ones.
     """
     places = _choose_places(path, steps)
+    given = np.abs(velocities).max(axis=0)  # kept at the ends, whatever the limits are
     slower = 1.0
     for _ in range(_TIGHTENINGS):
         speeds = compute_speeds(
             path,
             places,
-            limits.velocity / slower,
+            np.maximum(limits.velocity / slower, given),
             limits.acceleration / slower**2,
             end_speeds=end_speeds,
         )

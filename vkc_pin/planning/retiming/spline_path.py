@@ -22,6 +22,25 @@ def fit_path(
 ) -> CubicPath:
     """Return a cubic spline through waypoints, parametrised by the length of the polyline.
 
+    Args:
+        points: Waypoints, shape (m, n), m ≥ 2, consecutive ones distinct.
+        scale: Weight of each coordinate in the length, shape (n,).
+        limits: Lower and upper limits, shape (n,) each.
+        end_slopes: Given derivatives by the length at the ends; see `fit_path_at`.
+    """
+    lengths = np.linalg.norm(np.diff(points, axis=0) * scale, axis=1)
+    arc_lengths = np.concatenate([[0.0], np.cumsum(lengths)])
+    return fit_path_at(arc_lengths, points, limits, end_slopes)
+
+
+def fit_path_at(
+    positions: Floats,
+    points: Floats,
+    limits: tuple[Floats, Floats],
+    end_slopes: EndSlopes = FREE_ENDS,
+) -> CubicPath:
+    """Return a cubic spline through waypoints at given path positions.
+
     It is twice differentiable and linear in the waypoints, so that linear constraints that hold at
     all waypoints hold along it. If a coordinate would leave its limits between waypoints, all stay
     between their values at consecutive waypoints (Hyman, Accurate monotonicity preserving cubic
@@ -29,28 +48,25 @@ def fit_path(
     that is closed at the waypoints would open.
 
     Args:
-        points: Waypoints, shape (m, n), m ≥ 2, consecutive ones distinct.
-        scale: Weight of each coordinate in the length, shape (n,).
+        positions: Increasing path positions of the waypoints, shape (m,).
+        points: Waypoints, shape (m, n), m ≥ 2.
         limits: Lower and upper limits, shape (n,) each.
-        end_slopes: Given derivatives by the length at the ends, which are kept in any case.
+        end_slopes: Given derivatives at the ends, which are kept in any case.
     """
-    steps = np.diff(points, axis=0)
-    lengths = np.linalg.norm(steps * scale, axis=1)
-    arc_lengths = np.concatenate([[0.0], np.cumsum(lengths)])
-    chords = steps / lengths[:, None]
+    chords = np.diff(points, axis=0) / np.diff(positions)[:, None]
     begin, end = end_slopes
     if len(points) > 2 or begin is not None or end is not None:
-        slopes = compute_natural_slopes(arc_lengths, points, end_slopes)
+        slopes = compute_natural_slopes(positions, points, end_slopes)
     else:
         slopes = np.repeat(chords, 2, axis=0)
-    if not _exceeds_limits(points, slopes, arc_lengths, limits):
-        return CubicPath(arc_lengths, points, slopes)
+    if not _exceeds_limits(points, slopes, positions, limits):
+        return CubicPath(positions, points, slopes)
     limited_slopes = _limit_slopes(slopes, chords)
     if begin is not None:
         limited_slopes[0] = begin
     if end is not None:
         limited_slopes[-1] = end
-    return CubicPath(arc_lengths, points, limited_slopes)
+    return CubicPath(positions, points, limited_slopes)
 
 
 def _limit_slopes(slopes: Floats, chords: Floats) -> Floats:

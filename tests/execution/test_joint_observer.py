@@ -12,7 +12,7 @@ import pytest
 import vkc_pin as vkc
 from vkc_pin.errors import InputError
 from vkc_pin.execution import ExecutionResult, IdealRobot, RobotState, SimulatedRobot, execute
-from vkc_pin.world.scene.measured_joints import find_axis
+from vkc_pin.world.scene.estimated_joints import find_axis
 
 NOISE = (0.001, float(np.radians(0.3)))
 TILT = np.radians(5.0)

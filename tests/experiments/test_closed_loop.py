@@ -13,7 +13,7 @@ from vkc_pin.experiments.closed_loop import ROWS, _disturb
 from vkc_pin.experiments.tasks import TASKS, make_start
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.prepare import plan
-from vkc_pin.world.scene.measured_joints import find_axis
+from vkc_pin.world.scene.estimated_joints import find_axis
 
 
 @pytest.fixture(scope="module")

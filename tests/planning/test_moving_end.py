@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from helpers.judging import check, get_violation_names
 from helpers.small_problems import load_door_scene
+from oracle.changes import write_changed
 from oracle.judge import judge
 
 import vkc_pin as vkc
@@ -57,11 +59,12 @@ def test_other_end_velocities_are_violations(plan: vkc.Plan, tmp_path: Path) -> 
         }
         assert get_violation_names(check(other)) == {("velocity", name) for name in wrong}
     plan.save(tmp_path / "plan.npz")
-    with np.load(tmp_path / "plan.npz") as archive:
-        content = dict(archive)
-    content["about"] = np.array(str(content["about"]).replace('"base_y": -0.1', '"base_y": -0.2'))
-    np.savez(tmp_path / "changed.npz", **content)
-    found = {(one.rule, one.subject) for one in judge(tmp_path / "changed.npz").found}
+
+    def change(content: dict[str, Any]) -> None:
+        content["steps"][-1]["velocities"]["base_y"] = -0.2
+
+    changed = write_changed(tmp_path / "plan.npz", tmp_path / "changed.npz", change)
+    found = {(one.rule, one.subject) for one in judge(changed).found}
     assert found == {("velocity", "base_y")}
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from helpers.judging import check, get_violation_names
 from helpers.small_problems import load_door_scene
+from oracle.changes import write_changed
 from oracle.judge import judge
 
 import vkc_pin as vkc
@@ -51,11 +53,12 @@ def test_other_start_velocities_are_violations(moving_plan: vkc.Plan) -> None:
 
 def test_oracle_finds_other_start_velocities(moving_plan: vkc.Plan, tmp_path: Path) -> None:
     moving_plan.save(tmp_path / "plan.npz")
-    with np.load(tmp_path / "plan.npz") as archive:
-        content = dict(archive)
-    content["about"] = np.array(str(content["about"]).replace('"base_x": 0.2', '"base_x": 0.1'))
-    np.savez(tmp_path / "changed.npz", **content)
-    found = {(one.rule, one.subject) for one in judge(tmp_path / "changed.npz").found}
+
+    def change(content: dict[str, Any]) -> None:
+        content["scene"]["start"]["velocity"]["base_x"] = 0.1
+
+    changed = write_changed(tmp_path / "plan.npz", tmp_path / "changed.npz", change)
+    found = {(one.rule, one.subject) for one in judge(changed).found}
     assert found == {("velocity", "base_x")}
 
 

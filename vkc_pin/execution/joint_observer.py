@@ -11,6 +11,7 @@ import pinocchio as pin
 from vkc_pin.errors import InputError
 from vkc_pin.planning.plan import Plan
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.scene.estimated_joints import find_axis
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.joint_estimation import (
     DECISIVE,
@@ -21,7 +22,6 @@ from vkc_pin.world.scene.joint_estimation import (
     estimate_joint,
     fit_joint,
 )
-from vkc_pin.world.scene.measured_joints import find_axis
 from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.poses import as_placement
 from vkc_pin.world.scene.scene import Scene

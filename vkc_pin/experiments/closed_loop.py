@@ -29,8 +29,8 @@ from vkc_pin.simulation.physics import import_mujoco
 from vkc_pin.simulation.robot import SimulatedRobot
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.validate import validate
+from vkc_pin.world.scene.estimated_joints import find_axis
 from vkc_pin.world.scene.joint_estimation import JointEstimate
-from vkc_pin.world.scene.measured_joints import find_axis
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Actuate, Place, Step
 

@@ -14,9 +14,10 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.world.collision.batched_model import BatchedModel
 from vkc_pin.world.collision.boxes import WorldBoxes
 from vkc_pin.world.collision.distances import Shapes
-from vkc_pin.world.collision.solids import BatchedModel, flatten_placements
+from vkc_pin.world.collision.solids import flatten_placements
 from vkc_pin.world.models.coordinates import MovedJoint
 from vkc_pin.world.models.shapes import compute_bounding_box, compute_shape_distance
 from vkc_pin.world.scene.scene import Scene

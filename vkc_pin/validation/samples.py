@@ -12,7 +12,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import check_choice
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.validation.report import Violation
-from vkc_pin.world.collision.solids import BatchedModel
+from vkc_pin.world.collision.batched_model import BatchedModel
 from vkc_pin.world.models.articulated_object import Attachment, Freedom
 from vkc_pin.world.models.gripper import WIDTH_TOLERANCE
 from vkc_pin.world.scene.contact_rules import compute_hand_frame

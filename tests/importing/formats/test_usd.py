@@ -586,6 +586,16 @@ def test_disabled_bodies_are_static(tmp_path: Path) -> None:
 # Shapes
 
 
+def make_shape(folder: Path, kind: str, values: dict[str, Any]) -> tuple[Any, Any]:
+    """Return a stage with a body `/a`, and a shape of it with values of its attributes."""
+    stage = create_stage(folder / "t.usda")
+    add_body(stage, "/a")
+    shape = getattr(UsdGeom, kind).Define(stage, "/a/s")
+    for name, value in values.items():
+        shape.GetPrim().GetAttribute(name).Set(value)
+    return stage, shape
+
+
 def get_shape(found: Description) -> Part:
     (part,) = found.links["a"].collision
     return part
@@ -608,11 +618,7 @@ def get_shape(found: Description) -> Part:
 def test_primitives_have_their_defaults_and_scales(
     tmp_path: Path, kind: str, values: dict[str, Any], scale: Any, expected: Any
 ) -> None:
-    stage = create_stage(tmp_path / "t.usda")
-    add_body(stage, "/a")
-    shape = getattr(UsdGeom, kind).Define(stage, "/a/s")
-    for name, value in values.items():
-        shape.GetPrim().GetAttribute(name).Set(value)
+    stage, shape = make_shape(tmp_path, kind, values)
     UsdGeom.Xformable(shape).AddScaleOp().Set(Gf.Vec3f(*map(float, scale)))
     UsdPhysics.CollisionAPI.Apply(shape.GetPrim())
     part = get_shape(read(stage))
@@ -636,11 +642,7 @@ def test_other_solids_are_meshes(
     tmp_path: Path, axis: str, kind: str, values: dict[str, Any], size: Any, volume: float
 ) -> None:
     """Sizes are along the shape's own axes, z along its axis; meshes have less volume."""
-    stage = create_stage(tmp_path / "t.usda")
-    add_body(stage, "/a")
-    shape = getattr(UsdGeom, kind).Define(stage, "/a/s")
-    for name, value in values.items():
-        shape.GetPrim().GetAttribute(name).Set(value)
+    stage, shape = make_shape(tmp_path, kind, values)
     order = {"X": [2, 0, 1], "Y": [1, 2, 0], "Z": [0, 1, 2]}[axis]
     if kind == "Sphere":
         order = [0, 1, 2]

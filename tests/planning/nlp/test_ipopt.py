@@ -42,7 +42,7 @@ def test_ipopt_stops_when_the_budget_is_exhausted(
     assert stats["success"] is (iterations is None)
     assert running.evaluations == 10 * (stats["iter_count"] + 1)
     if iterations is None:
-        np.testing.assert_allclose(np.ravel(result["x"]), 1.0, atol=1e-6)
+        np.testing.assert_allclose(result["x"].full(), 1.0, atol=1e-6)
     else:
         assert stats["return_status"] == "User_Requested_Stop"
         assert stats["iter_count"] == iterations

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.world.collision import distances as distances_module
+from vkc_pin.world.collision.batched_model import BatchedModel
 from vkc_pin.world.collision.boxes import Boxes
 from vkc_pin.world.collision.distances import Clearances, MarginRegion, Margins, Shapes
-from vkc_pin.world.collision.solids import BatchedModel
 from vkc_pin.world.models.shapes import compute_shape_distance
 
 SEEDS = st.integers(0, 2**32 - 1)

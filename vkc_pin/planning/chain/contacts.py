@@ -21,8 +21,8 @@ from vkc_pin.planning.chain.chain import VirtualKinematicChain
 from vkc_pin.planning.chain.collision_pairs import PhaseGeometry, build_phase_geometries
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.utils.budget import record_evaluations
+from vkc_pin.world.collision.batched_model import BatchedModel
 from vkc_pin.world.collision.distances import Clearances, Shapes
-from vkc_pin.world.collision.solids import BatchedModel
 from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene

@@ -14,9 +14,9 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.world.collision.batched_model import BatchedModel
 from vkc_pin.world.collision.boxes import Boxes
 from vkc_pin.world.collision.solids import (
-    BatchedModel,
     convert_solid,
     count_threads,
     flatten_placements,

@@ -6,21 +6,22 @@ import os
 import weakref
 from collections.abc import Sequence
 from functools import cache
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import coal
 import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import BuildError, InputError
-from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.optional_imports import REBUILD_HINT, import_compiled
 from vkc_pin.utils.system import count_cores
 from vkc_pin.world.files.meshes import get_triangles
 
 _MAX_THREADS = 8
 _PLACEMENT_SIZE = 12
-_FIRST_TRANSLATION = 9  # index of the translation among the numbers of a placement
+FIRST_TRANSLATION = 9
+"""Index of the translation among the numbers of a placement."""
 
 
 class _Cached(NamedTuple):
@@ -130,68 +131,6 @@ def flatten_placements(placements: Sequence[pin.SE3]) -> Floats:
     """
     rows = np.empty((len(placements), _PLACEMENT_SIZE))
     for row, placement in zip(rows, placements, strict=True):
-        row[:_FIRST_TRANSLATION] = placement.rotation.T.ravel()
-        row[_FIRST_TRANSLATION:] = placement.translation
+        row[:FIRST_TRANSLATION] = placement.rotation.T.ravel()
+        row[FIRST_TRANSLATION:] = placement.translation
     return rows
-
-
-class BatchedModel:
-    """A model with M frames at W configurations at once; results are Pinocchio's, bit by bit.
-
-    Args:
-        model: The model, with nq coordinates and nv velocities.
-        joints: Joint of each frame, shape (M,).
-        placements: Placements of the frames on their joints, see `flatten_placements`, (M, 12).
-    """
-
-    def __init__(self, model: pin.Model, joints: Ints, placements: Floats) -> None:
-        serialized = pin.serialization.StreamBuffer()
-        model.saveToBinary(serialized)
-        content = bytes(serialized.view())  # tobytes() would leak a view at every call
-        self.compiled: Any = load_compiled().Bodies(content, joints, placements)
-
-    @classmethod
-    def of_shapes(cls, model: pin.Model, geometry: pin.GeometryModel) -> Self:
-        """Return a model with its shapes as frames."""
-        shapes = geometry.geometryObjects
-        joints = np.array([shape.parentJoint for shape in shapes], np.int64)
-        return cls(model, joints, flatten_placements([shape.placement for shape in shapes]))
-
-    @classmethod
-    def of_frames(cls, model: pin.Model, numbers: Sequence[int]) -> Self:
-        """Return a model with some of its frames."""
-        frames = [model.frames[number] for number in numbers]
-        joints = np.array([frame.parentJoint for frame in frames], np.int64)
-        return cls(model, joints, flatten_placements([frame.placement for frame in frames]))
-
-    def compute_placements(self, q: Floats) -> Floats:
-        """Return the placements of the frames in the world, shape (W, M, 12).
-
-        Args:
-            q: Pinocchio configurations, shape (W, nq).
-
-        Returns:
-            Placements in the format of `flatten_placements`.
-        """
-        return np.asarray(self.compiled.placements(q), float)
-
-    def compute_poses(self, q: Floats) -> tuple[Floats, Floats]:
-        """Return rotations, shape (W, M, 3, 3), and origins, shape (W, M, 3) [m], in the world."""
-        placements = self.compute_placements(q)
-        columns = placements[..., :_FIRST_TRANSLATION]
-        rotations = columns.reshape(*columns.shape[:-1], 3, 3).swapaxes(-1, -2)
-        return rotations, placements[..., _FIRST_TRANSLATION:]
-
-    def compute_jacobians(self, q: Floats) -> Floats:
-        """Return the Jacobians at the frames' origins in the axes of the world, (W, M, 6, nv)."""
-        return np.asarray(self.compiled.jacobians(q), float)
-
-    def compute_inverse_dynamics(self, q: Floats, v: Floats, a: Floats) -> Floats:
-        """Return the joint torques by recursive Newton-Euler, shape (W, nv) [N·m], [N].
-
-        Args:
-            q: Pinocchio configurations, shape (W, nq).
-            v: Velocities, shape (W, nv).
-            a: Accelerations, shape (W, nv).
-        """
-        return np.asarray(self.compiled.inverse_dynamics(q, v, a), float)

@@ -212,11 +212,8 @@ def compute_bounding_box(shape: pin.GeometryObject) -> tuple[Floats, Floats]:
 
 def compute_world_box(shape: coal.CollisionGeometry, placement: pin.SE3) -> tuple[Floats, Floats]:
     """Return the corners of a shape's axis-aligned box in the world frame, shape (3,) each [m]."""
-    shape.computeLocalAABB()
-    center = placement.act(np.asarray(shape.aabb_local.center(), float))
-    # A box with the half extents h and the rotation R reaches |R| h along the axes of the world.
-    extent = np.abs(placement.rotation) @ _get_half_extents(shape)
-    return center - extent, center + extent
+    (lower,), (upper,) = _compute_world_boxes([(shape, placement)])
+    return lower, upper
 
 
 class ShapeDistances:

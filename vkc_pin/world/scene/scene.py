@@ -33,6 +33,7 @@ from vkc_pin.world.models.shapes import (
     list_placed_shapes,
 )
 from vkc_pin.world.scene.clearance_exemptions import warn_of_overlaps
+from vkc_pin.world.scene.estimated_joints import place_on_estimate
 from vkc_pin.world.scene.hold import (
     Hold,
     check_hold_order,
@@ -45,7 +46,6 @@ from vkc_pin.world.scene.hold import (
     warn_of_openings,
 )
 from vkc_pin.world.scene.joint_estimation import JointEstimate
-from vkc_pin.world.scene.measured_joints import place_on_estimate
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.placed_object import PlacedObject, make_world_shapes
 from vkc_pin.world.scene.poses import as_placement

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats, Ints
-from vkc_pin.world.collision.solids import BatchedModel
+from vkc_pin.world.collision.batched_model import BatchedModel
 from vkc_pin.world.models.dynamics import TorqueLimits, compute_inertia
 from vkc_pin.world.scene.contact_rules import compute_hand_frame
 from vkc_pin.world.scene.hold import Hold, get_attachment

@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 
 import vkc_pin as vkc
-from vkc_pin.world.scene.measured_joints import find_axis
+from vkc_pin.world.scene.estimated_joints import find_axis
 
 CASES = [
     ("door", "door", "hinge", "panel"),

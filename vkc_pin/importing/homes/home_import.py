@@ -13,8 +13,11 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
+from vkc_pin.importing.description import Description
+from vkc_pin.importing.formats.detection import check_no_arguments
 from vkc_pin.importing.formats.reading import FORMATS
 from vkc_pin.importing.homes.allowed_contacts import read_home_contacts
+from vkc_pin.importing.homes.mesh_rooms import MESH_SUFFIXES, read_mesh_room
 from vkc_pin.importing.homes.splitting import FLOOR_RISE, Home, add_floor, split_home
 from vkc_pin.importing.homes.writing import (
     ImportedHomeObject,
@@ -107,7 +110,7 @@ def import_home(  # noqa: PLR0913 - keyword options of a public call
     file: str | Path,
     folder: str | Path | None = None,
     *,
-    floor: float = 0.0,
+    floor: float | None = None,
     robot: str | Path = "husky_ur5e",
     options: Options | None = None,
     most: int = 2,
@@ -117,18 +120,20 @@ def import_home(  # noqa: PLR0913 - keyword options of a public call
     packages: Mapping[str, str | Path] | None = None,
     arguments: Mapping[str, str] | None = None,
 ) -> ImportedHome:
-    """Import a URDF, xacro, MJCF, SDF or USD file of a whole home as a scene.
+    """Import a URDF, xacro, MJCF, SDF or USD file, or a mesh, of a whole home as a scene.
 
     Fixed links become obstacles of convex pieces. A fixed link with joints becomes an articulated
     object, for whose joints attachments are proposed. Floating links become free objects. The arena
     covers the home and, on sides without walls, 2 m of floor around it. The robot starts at a free
-    pose from which it reaches most objects. Long imports log their progress to the logger
+    pose from which it reaches most objects. A mesh, such as a scan, is divided into its floor and
+    connected surfaces, which become obstacles. Long imports log their progress to the logger
     ``vkc_pin.importing``.
 
     Args:
-        file: The file; its z axis points up.
+        file: The file; its z axis points up, except in glTF, which is turned.
         folder: Output folder, new or empty; defaults to one named like the file.
-        floor: Height of the floor in the file [m].
+        floor: Height of the floor in the file [m]. Default: 0, and of a mesh that of most
+            horizontal area in its lower half.
         robot: Robot of the scene: its name, or the path of a URDF or robot.yaml.
         options: Options with the clearances of attachments.
         most: Largest number of attachments of one joint.
@@ -144,22 +149,22 @@ def import_home(  # noqa: PLR0913 - keyword options of a public call
             files; an argument is invalid; or the robot finds no start pose.
         UnknownNameError: The robot is unknown, or the file refers to an undefined name.
     """
-    path = check_path(file, "file", f"a {FORMATS} file")
-    floor = check_number(floor, "floor", "a height [m]", low=-_LARGEST, high=_LARGEST)
+    path = check_path(file, "file", f"a {FORMATS} file, or a mesh")
+    if floor is not None:
+        floor = check_number(floor, "floor", "a height [m]", low=-_LARGEST, high=_LARGEST)
     check_integer(most, "most", low=1, high=100)
     rng = np.random.default_rng(check_integer(seed, "seed", low=0))
     options = Options() if options is None else check_instance(options, Options, "options")
     loaded_robot = load_robot(robot)
     name = _choose_name(path)
     target = Path(name) if folder is None else check_path(folder, "folder", "a folder")
-    check_source(path, f"a {FORMATS} file")
+    check_source(path, f"a {FORMATS} file, or a mesh")
     check_target(target, _COMMAND, force=check_bool(force, "force"))
     srdf_path = None if srdf is None else check_path(srdf, "srdf")
-    original = read_object(path, free=True, packages=packages, arguments=arguments)
-    original = original.check_meshes(is_home=True)
+    original, height = _read_home(path, floor, packages, arguments)
     description = rename_for_scenes(original)
     contacts = read_home_contacts(path, srdf_path, original.links, description.links)
-    description = move_root(description, pin.SE3(np.eye(3), np.array([0.0, 0.0, -floor])))
+    description = move_root(description, pin.SE3(np.eye(3), np.array([0.0, 0.0, -height])))
     low, high = compute_bounds(description, load_surfaces(description))
     home = split_home(description)
     # `check_target` allowed replacing it
@@ -221,6 +226,20 @@ def import_home(  # noqa: PLR0913 - keyword options of a public call
         reached,
         tuple(notes),
     )
+
+
+def _read_home(
+    path: Path,
+    floor: float | None,
+    packages: Mapping[str, str | Path] | None,
+    arguments: Mapping[str, str] | None,
+) -> tuple[Description, float]:
+    """Return the description of a home, and the height of its floor [m]."""
+    if path.suffix.lower() in MESH_SUFFIXES:
+        check_no_arguments(path, arguments or {})
+        return read_mesh_room(path, floor)
+    description = read_object(path, free=True, packages=packages, arguments=arguments)
+    return description.check_meshes(is_home=True), 0.0 if floor is None else floor
 
 
 def _choose_name(path: Path) -> str:

@@ -22,10 +22,11 @@ from vkc_pin.utils.arrays import Floats
 
 FLOOR_RISE = 0.02
 """Height up to which shapes are part of the floor [m]: slabs, carpets and thresholds."""
+BUILDING = 3.5
+"""Length above which a link is part of the building, not furniture [m]."""
 _FLOOR_BEYOND = 2.0  # [m] of floor on sides without walls: a robot's length, and an arm's
 _WALL_HEIGHT = 0.5  # [m] at which walls are found, below windows
 _WALL_DEPTH = 0.5  # [m] from the side of the home within which walls belong to the side
-_BUILDING = 3.5  # [m] length above which a link is part of the building, not furniture
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +123,7 @@ class _Splitter:
         for child in self._children.get(name, ()):
             if description.joints[child].kind in MOVING_KINDS:
                 children.append(child)
-        is_building = name == description.root or _measure_length(link) > _BUILDING
+        is_building = name == description.root or _measure_length(link) > BUILDING
         if children and not is_building:
             attached = {name}
             for child in children:

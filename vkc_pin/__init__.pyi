@@ -27,6 +27,7 @@ from .validation.report import Report, Violation
 from .validation.tolerances import Tolerances
 from .validation.validate import validate
 from .world.models.articulated_object import ArticulatedObject, Attachment, Freedom, Latch
+from .world.models.camera import Camera
 from .world.models.object_file import load_object
 from .world.models.robot import Robot
 from .world.models.robot_file import load_robot
@@ -36,6 +37,7 @@ from .world.scene.placed_object import PlacedObject
 from .world.scene.scene import Scene, load_scene
 from .world.task.steps import Actuate, Configure, GoTo, Grasp, Place, Reach, Release, Touch
 from .world.task.terms import Constraint, Cost, State
+from .world.task.views import keep_in_view, prefer_in_view
 from .world.trajectory.phase_span import PhaseSpan
 from .world.trajectory.trajectory import Trajectory
 
@@ -47,6 +49,7 @@ __all__ = [
     "ArticulatedObject",
     "Attachment",
     "BuildError",
+    "Camera",
     "Configure",
     "Constraint",
     "Cost",
@@ -94,10 +97,12 @@ __all__ = [
     "importing",
     "inverse_kinematics",
     "invert",
+    "keep_in_view",
     "load_object",
     "load_robot",
     "load_scene",
     "plan",
+    "prefer_in_view",
     "prepare",
     "procedural",
     "replan",

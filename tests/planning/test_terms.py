@@ -222,3 +222,14 @@ def test_plans_are_saved_with_their_terms(
     assert "not a saved term" in capsys.readouterr().err
     del about["terms"]  # a plan from before terms existed
     assert vkc.Plan.load(save()).terms == ()
+
+
+def test_another_attachment_does_not_evade_a_constraint() -> None:
+    """Phases are named after attachments: those of another one have other names."""
+    scene = vkc.load_scene("door")
+    reach = "reach door.handle"
+    term = vkc.Constraint("far", lambda s: s.coordinate("base_x"), lower=4.9, during=reach)
+    options: dict[str, Any] = {"options": SHORT, "initialization": "interpolated"}
+    plan = vkc.plan(scene, [vkc.Actuate("door", {"hinge": 0.3})], terms=[term], **options)
+    assert not plan.success
+    assert any("which it lacks" in note for note in plan.report.notes), plan.summary()

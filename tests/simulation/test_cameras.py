@@ -8,8 +8,9 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 import vkc_pin as vkc
-from vkc_pin.simulation.cameras import BASE, HAND, ROBOT, Camera, Images, render_images
+from vkc_pin.simulation.cameras import ROBOT, Images, render_images
 from vkc_pin.simulation.replay import Replay
+from vkc_pin.world.models.camera import BASE, HAND, Camera
 from vkc_pin.world.models.robot_file import load_robot
 
 points = st.tuples(*[st.floats(-3.0, 3.0)] * 3)

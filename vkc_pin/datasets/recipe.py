@@ -19,7 +19,6 @@ from vkc_pin.options import Options
 from vkc_pin.procedural.rooms.fixtures import list_openable_types
 from vkc_pin.procedural.rooms.parts import CARRIED
 from vkc_pin.procedural.rooms.random_room import RoomSettings
-from vkc_pin.simulation.cameras import BASE, HAND, Camera, resolve_frame
 from vkc_pin.utils.arguments import check_choice, check_mapping
 from vkc_pin.world.files.documents import Document, parse_document, read_yaml
 from vkc_pin.world.files.fields import (
@@ -34,6 +33,7 @@ from vkc_pin.world.files.fields import (
     wrap_text,
 )
 from vkc_pin.world.files.resources import find_file, list_resources
+from vkc_pin.world.models.camera import BASE, HAND, Camera, resolve_frame
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import find_robot
 from vkc_pin.world.scene.scene import Scene

@@ -13,12 +13,12 @@ from vkc_pin.datasets.recipe import Recipe, check_robot, get_robot_name, is_path
 from vkc_pin.errors import InputError
 from vkc_pin.importing.robots.mesh_pieces import copy_meshes
 from vkc_pin.importing.robots.robot_import import import_robot
-from vkc_pin.simulation.cameras import check_frame
 from vkc_pin.simulation.physics import import_mujoco
 from vkc_pin.simulation.snapshots import open_gl_context
 from vkc_pin.world.files.documents import read_text
 from vkc_pin.world.files.urdf import read_urdf
 from vkc_pin.world.files.writing import check_name, write_atomically
+from vkc_pin.world.models.camera import check_frame
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import find_robot, find_robot_files, load_robot
 from vkc_pin.world.scene.scene import load_scene

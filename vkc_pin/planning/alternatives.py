@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 
 from vkc_pin.errors import InputError
 from vkc_pin.planning.request import PlanningRequest
@@ -17,6 +17,7 @@ from vkc_pin.world.task.actuation import find_shared_coordinate
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.phases import Task
 from vkc_pin.world.task.steps import Step
+from vkc_pin.world.task.terms import Term
 
 PlanStepByStep = Callable[[Scene, Task, PlanningRequest], Schedule[TaskResult]]
 """Plans the steps of a task one after the other."""
@@ -74,7 +75,7 @@ def solve_with_alternatives(
             break
         try:
             with share_budget(len(alternatives()) - number):
-                other = yield from _solve_steps(scene, steps, requests, plan_step_by_step)
+                other = yield from _solve_steps(scene, task, steps, requests, plan_step_by_step)
         except InputError as error:
             notes.append(f"at {name}: {error}")
             continue
@@ -109,21 +110,36 @@ def _generate_steps(
 
 def _solve_steps(
     scene: Scene,
+    original: Task,
     steps: Sequence[Step],
     requests: Sequence[PlanningRequest],
     plan_step_by_step: PlanStepByStep | None,
 ) -> Schedule[TaskResult]:
-    """Solve the steps of an alternative.
+    """Solve the steps of an alternative to a task.
 
     Raises:
-        InputError: They are impossible in the scene, or no problem of the kind that is wanted.
+        InputError: They are impossible in the scene, lack a phase of the user's terms, or are no
+            problem of the kind that is wanted.
     """
     task = compile_task(scene, steps, requests[0].options)
+    _check_terms_kept(requests[0].terms, original, task)
     if find_shared_coordinate(scene, task.holds) is None:
         return (yield from solve(scene, task, requests, check_goals_first=True))
     if plan_step_by_step is None:
         raise InputError("its grasps cannot be part of one problem")
     return (yield from plan_step_by_step(scene, task, requests[0]))
+
+
+def _check_terms_kept(terms: Iterable[Term], original: Task, alternative: Task) -> None:
+    """Check that an alternative has all phases of a task that terms name.
+
+    Phases are named after attachments: without them, a constraint would not hold anywhere.
+    """
+    names = {phase.name for phase in original.phases} - {one.name for one in alternative.phases}
+    for term in terms:
+        for name in term.during or ():
+            if name in names:
+                raise InputError(f"the term {term.name!r} holds during {name!r}, which it lacks")
 
 
 def _combine_failures(

@@ -10,6 +10,7 @@ import pinocchio as pin
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.samples import Samples
+from vkc_pin.validation.sights import find_occlusions
 from vkc_pin.world.task.terms import Constraint, Formula, Term
 
 # tolerance between waypoints over that at waypoints
@@ -38,6 +39,11 @@ def _check_constraint(samples: Samples, term: Constraint) -> Iterator[Violation]
     rows = np.sort(np.concatenate([at, between]))
     if not len(rows):
         return
+    if term.sight is not None:
+        for row, link in find_occlusions(samples, term.sight, rows):
+            detail = f"{link} is in front of it"
+            yield samples.make_violation("term", term.name, 1.0, "", detail, row=row)
+            break
     values = term.formula.evaluate(_compute_inputs(samples, term.formula, rows))
     lower, upper = term.compute_bounds(term.formula.rows)
     excess = np.maximum(lower - values, values - upper)

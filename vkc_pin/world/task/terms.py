@@ -19,6 +19,7 @@ from vkc_pin.errors import InputError, UnknownNameError, format_value
 from vkc_pin.utils.arguments import (
     check_array,
     check_choice,
+    check_finite_array,
     check_list,
     check_mapping,
     check_number,
@@ -290,6 +291,27 @@ class _Term:
 
 
 @dataclass(frozen=True)
+class Sight:
+    """A line of sight from a camera of the robot to a point, which the robot itself may cross.
+
+    Attributes:
+        frame: Frame of the robot on which the camera is mounted.
+        position: Position of the camera in this frame [m].
+        target: Frame of the robot, or link of an object, on which the point is; "": the world.
+        point: Position of the point in this frame [m].
+        hand: Tool frame of the robot.
+        until: Distance between tool frame and point up to which the line does not count [m].
+    """
+
+    frame: str
+    position: tuple[float, float, float]
+    target: str
+    point: tuple[float, float, float]
+    hand: str
+    until: float
+
+
+@dataclass(frozen=True)
 class Constraint(_Term):
     """An expression that is bounded at every waypoint of the chosen phases but their first.
 
@@ -303,12 +325,15 @@ class Constraint(_Term):
         holding: Object that must be held for the constraint to apply; None: none.
         tolerance: Violation that validation accepts at a waypoint, in the unit of the expression;
             ten times as much between waypoints, where the program has no constraint.
+        sight: A line that no link of the robot may cross while the constraint holds, which
+            validation checks; see `keep_in_view`.
     """
 
     _: KW_ONLY
     lower: Numbers | None = None
     upper: Numbers | None = None
     tolerance: float = 1e-3
+    sight: Sight | None = None
 
     def __post_init__(self) -> None:
         self._check()
@@ -420,7 +445,12 @@ def rename_term(term: Term, frames: Mapping[str, str], objects: Mapping[str, str
     holding = term.holding
     if holding is not None:
         holding = objects.get(holding, holding)
-    return replace(term, expression=formula, holding=holding)
+    renamed = replace(term, expression=formula, holding=holding)
+    if not isinstance(renamed, Constraint) or renamed.sight is None:
+        return renamed
+    ends = (renamed.sight.frame, renamed.sight.target)
+    frame, target = (frames.get(name, name) for name in ends)
+    return replace(renamed, sight=replace(renamed.sight, frame=frame, target=target))
 
 
 def _trace_all(
@@ -509,6 +539,8 @@ def term_from_dict(data: Mapping[str, Any]) -> Term:
     try:
         formula = _formula_from_dict(fields.pop("expression"))
         kind = kinds[fields.pop("term")]
+        if fields.get("sight") is not None:
+            fields["sight"] = _sight_from_dict(fields["sight"])
         return kind(expression=formula, **fields)
     except (LookupError, TypeError, ValueError, OverflowError, RuntimeError) as error:
         raise InputError(
@@ -517,6 +549,15 @@ def term_from_dict(data: Mapping[str, Any]) -> Term:
             expected="a term written by Plan.save",
             got=str(error),
         ) from error
+
+
+def _sight_from_dict(data: Any) -> Sight:
+    position, point = (check_finite_array(data[name], name) for name in ("position", "point"))
+    x, y, z = position.tolist()
+    u, v, w = point.tolist()
+    hand = str(data["hand"])
+    until = check_number(data["until"], "until")
+    return Sight(str(data["frame"]), (x, y, z), str(data["target"]), (u, v, w), hand, until)
 
 
 def _formula_from_dict(data: Any) -> Formula:

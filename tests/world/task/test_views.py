@@ -1,0 +1,140 @@
+"""Tests terms that keep a point in the view of a camera."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.expected_errors import expect_error
+from helpers.judging import get_violation_names
+
+import vkc_pin as vkc
+from vkc_pin.errors import UnknownNameError
+from vkc_pin.utils.arrays import Floats
+
+STEPS = [vkc.Actuate("door", {"hinge": 0.6})]
+REACH = "reach door.handle"
+SIZE: dict[str, Any] = {"width": 640, "height": 480}
+FRONT = vkc.Camera("front", "base", (0.3, 0.0, 1.2), (2.0, 0.0, 0.9), fov=58.0, **SIZE)
+WRIST = vkc.Camera(
+    "wrist", "hand", (0.0, -0.1, -0.05), (0.0, 0.0, 0.4), up=(0.0, -1.0, 0.0), fov=70.0, **SIZE
+)
+
+
+@cache
+def load_facing_scene() -> vkc.Scene:
+    """Return the door's scene with a robot that faces the door."""
+    scene = vkc.load_scene("door")
+    x, y, yaw = scene.start[:3].tolist()
+    return scene.with_start(base=[x, y, yaw + np.pi])
+
+
+def check(plan: vkc.Plan, term: vkc.Constraint) -> vkc.Report:
+    """Validate a plan with a term."""
+    return vkc.validate(plan.scene, plan.steps, plan.trajectory, plan.options, [term])
+
+
+def project(plan: vkc.Plan, camera: vkc.Camera, time: float) -> Floats:
+    """Return the handle in a camera's image: x and y in half sizes, and depth [m]."""
+    placement = plan.pose(camera.find_frame(plan.scene.robot), time) * camera.placement
+    attachment = plan.scene.objects["door"].object.attachment("handle")
+    handle = plan.pose(f"door.{attachment.link}", time) * attachment.placement
+    x, y, z = placement.actInv(handle.translation)
+    half = -z * np.tan(np.radians(camera.fov) / 2.0)
+    return np.array([x / half * camera.height / camera.width, y / half, -z])
+
+
+@pytest.mark.parametrize("camera", [FRONT, WRIST], ids=["front", "wrist"])
+def test_handle_stays_in_the_image_until_the_hand_is_near(camera: vkc.Camera) -> None:
+    scene = load_facing_scene()
+    term = vkc.keep_in_view(scene, camera, "door.handle", during=REACH)
+    free = vkc.plan(scene, STEPS)
+    assert get_violation_names(check(free, term)) == {("term", term.name)}
+    plan = vkc.plan(scene, STEPS, terms=[term])
+    assert plan.success, plan.summary()
+    motion = plan.trajectory
+    seen = []
+    for waypoint in range(1, motion.phases[0].last + 1):
+        time = motion.times[waypoint]
+        hand = plan.pose(scene.robot.tool_frame, time).translation
+        attachment = scene.objects["door"].object.attachment("handle")
+        handle = plan.pose(f"door.{attachment.link}", time) * attachment.placement
+        if np.linalg.norm(hand - handle.translation) > 0.3:
+            seen.append(project(plan, camera, time))
+    x, y, depth = np.array(seen).T
+    assert len(seen) > 10
+    assert (depth > 0.05).all()
+    assert (np.abs(x) < 1.0).all()
+    assert (np.abs(y) < 1.0).all()
+
+
+def test_preferred_view_turns_the_camera_to_the_handle() -> None:
+    scene = load_facing_scene()
+    shares = []
+    for terms in ([], [vkc.prefer_in_view(scene, FRONT, "door.handle", weight=0.3)]):
+        plan = vkc.plan(scene, STEPS, terms=terms)
+        assert plan.success, plan.summary()
+        times = np.linspace(0.0, plan.trajectory.times[plan.trajectory.phases[0].last], 60)
+        images = np.array([project(plan, FRONT, time) for time in times])
+        is_inside = (np.abs(images[:, :2]) < 1.0).all(axis=1) & (images[:, 2] > 0.0)
+        shares.append(is_inside.mean())
+    assert shares[1] > shares[0] + 0.3
+
+
+def test_arm_in_front_of_the_target_is_a_violation() -> None:
+    """The target is on the line from the camera through the forearm, 1 m behind it."""
+    scene = vkc.load_scene("door")
+    plan = vkc.plan(scene, [vkc.GoTo(*scene.start[:2] + 0.05, scene.start[2])])
+    assert plan.success
+    start = plan.scene
+    eye = plan.pose("base_link", 0.0).act(np.array([-0.6, 0.0, 0.8]))
+    for link, is_hidden in (("forearm_link", True), ("nothing", False)):
+        through = eye + np.array([0.0, 0.0, 1.0])
+        if is_hidden:
+            shape = next(one for one in start.robot.collision.geometryObjects if link in one.name)
+            shape.geometry.computeLocalAABB()
+            frame = plan.pose(link, 0.0)
+            through = frame.act(shape.placement.act(shape.geometry.aabb_local.center()))
+        direction = (through - eye) / np.linalg.norm(through - eye)
+        target = through + direction
+        camera = vkc.Camera(
+            "rear",
+            "base_link",
+            (-0.6, 0.0, 0.8),
+            tuple(plan.pose("base_link", 0.0).actInv(target).tolist()),
+            up=(0.0, 1.0, 0.1),
+            fov=90.0,
+        )
+        term = vkc.keep_in_view(start, camera, target, until=0.0)
+        found = check(plan, term)
+        texts = [one.detail for one in found.violations]
+        assert any("in front of it" in text for text in texts) is is_hidden, texts
+
+
+def test_plans_keep_the_line_of_sight_in_files(tmp_path: Path) -> None:
+    scene = load_facing_scene()
+    term = vkc.keep_in_view(scene, WRIST, "door.handle", during=REACH)
+    plan = vkc.plan(scene, STEPS, terms=[term])
+    assert plan.success
+    (again,) = vkc.Plan.load(plan.save(tmp_path / "plan.npz")).terms
+    assert again == plan.terms[0]
+    assert isinstance(again, vkc.Constraint)
+    assert again.sight == term.sight
+
+
+def test_wrong_cameras_and_targets_are_named() -> None:
+    scene = load_facing_scene()
+    with pytest.raises(UnknownNameError, match=r"wrist_4"):
+        vkc.keep_in_view(scene, replace(WRIST, frame="wrist_4_link"), "door.handle")
+    with pytest.raises(UnknownNameError, match=r"door\.handle"):
+        vkc.keep_in_view(scene, WRIST, "door.handel")
+    with expect_error("wrong shape", field="target"):
+        vkc.prefer_in_view(scene, WRIST, [1.0, 2.0])
+    with expect_error("not finite", field="target[1]"):
+        vkc.keep_in_view(scene, WRIST, [1.0, np.nan, 0.0])
+    with expect_error(field="margin"):
+        vkc.keep_in_view(scene, WRIST, "door.handle", margin=50.0)

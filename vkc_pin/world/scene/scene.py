@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pinocchio as pin
@@ -79,9 +79,10 @@ class Scene:
             hand.
         obstacles: Fixed obstacles as convex shapes: parent joint 0, placement in the world frame,
             colour set. An obstacle of one shape has its name, one of several shapes
-            `<name>_<number>`. The floor is among them.
-        obstacle_labels: Name of the obstacle of each of these shapes (`FLOOR` for the floor).
-        obstacle_names: Names of the obstacles in the order of the file, without the floor.
+            `<name>_<number>`. The floor and the boxes of the map are among them.
+        obstacle_labels: Name of the obstacle of each of these shapes (`FLOOR` for the floor, `MAP`
+            for the map).
+        obstacle_names: Names of the obstacles in the order of the file, without floor and map.
         obstacle_visual: Visual shapes of the obstacles, without the floor.
         obstacle_visual_labels: Name of the obstacle of each of these shapes.
         floor: Whether there is a floor at z = 0.
@@ -348,6 +349,43 @@ class Scene:
         pose = as_placement(placement, name="placement")
         # Results in `memory` depend on the obstacles: the copy begins with none.
         return dataclasses.replace(self, **move_obstacle(vars(self), name, pose))
+
+    def with_map(
+        self,
+        file: str | Path,
+        *,
+        height: float = 2.0,
+        unknown: Literal["blocked", "free"] = "blocked",
+    ) -> Scene:
+        """Return the scene on an occupancy map of ROS, whose occupied cells become obstacles.
+
+        The map replaces an earlier one. The arena remains if it was stated and is within the
+        bounding box of the map, which it becomes otherwise. The start must be in it.
+
+        Args:
+            file: A `map.yaml` of map_server or Nav2.
+            height: Height of the obstacles above the floor [m].
+            unknown: Whether cells that are neither occupied nor free are "blocked" as well, or
+                "free". Parts of the arena beyond the image are unknown.
+
+        Raises:
+            InputError: A file cannot be read, an argument is invalid, or the start is outside.
+        """
+        path = check_path(file, "file", "the path of a map.yaml")
+        document = self.document
+        entry = {"file": str(path.absolute()), "height": height, "unknown": unknown}
+        document["map"] = entry
+        arena = document.pop("arena")
+        on_map = Scene.from_document(document, self.folder)
+        x_min, x_max, y_min, y_max = on_map.arena
+        is_stated = self.described.arena is not None
+        is_within = (
+            x_min <= self.arena[0] <= self.arena[1] <= x_max
+            and y_min <= self.arena[2] <= self.arena[3] <= y_max
+        )
+        if not (is_stated and is_within):
+            return on_map
+        return Scene.from_document({**document, "arena": arena}, self.folder)
 
     def with_held(
         self,

@@ -60,13 +60,14 @@ def add_importing(commands: Any) -> None:
     _add_hand(item, most=3)
 
     about = (
-        "Import a whole home from a URDF, xacro, MJCF, SDF or USD file as a scene: fixed parts "
+        "Import a whole home from a URDF, xacro, MJCF, SDF, USD or MoveIt .scene "
+        "file as a scene: fixed parts "
         "become obstacles of convex pieces, parts with joints become objects with attachments, "
         "and free parts become objects to carry. The robot starts at a free pose. The report lists "
         "changes, and parts that no hand can move."
     )
     home = add_command(commands, "import-home", "import a whole home", _import_home, about)
-    add_option(home, "file FILE", "URDF, xacro, MJCF, SDF or USD")
+    add_option(home, "file FILE", "URDF, xacro, MJCF, SDF, USD or MoveIt .scene")
     _add_output(home, "import-home")
     about = "height of the floor in the file (default 0)"
     add_option(home, "--floor METRES", about, type=float, default=0.0)

@@ -239,6 +239,32 @@ class Scene:
         start_velocity = make_robot_velocity(self.robot, start, wanted)
         return self._with(start=start, start_velocity=start_velocity)
 
+    def with_joint_state(self, message: Mapping[str, Any]) -> Scene:
+        """Return the scene with the start that a message of ROS or MoveIt states.
+
+        Names may have any order. Joints that the message lacks keep their start, others that are
+        not planned (wheels, fingers, followers) are named in a warning. Velocities and efforts are
+        not used; see `with_start` for velocities.
+
+        Args:
+            message: Mapping with the fields of `sensor_msgs/JointState` (`name`, `position`) or of
+                `moveit_msgs/RobotState`, whose `multi_dof_joint_state` with one joint is the base
+                in the frame of the scene. `rosidl_runtime_py.message_to_ordereddict` makes it of a
+                message.
+
+        Raises:
+            InputError: A field is missing or invalid, the base is tilted, or a value is outside its
+                limits or the arena.
+        """
+        from vkc_pin.world.scene.joint_state import note_other_joints, parse_joint_state
+
+        state = parse_joint_state(message)
+        names = self.robot.coordinates.names[3:]
+        arm = {name: state.positions[name] for name in names if name in state.positions}
+        for note in (*state.notes, *note_other_joints(state.positions, names)):
+            warnings.warn(f"{self.name}: {note}", stacklevel=2)
+        return self.with_start(state.base, arm)
+
     def _check_start_values(self, values: ArrayLike, field: str, part: slice) -> list[float]:
         """Return the values of a `part` of the coordinates at the start."""
         given = check_array(values, field)

@@ -20,6 +20,7 @@ NAMES = (
     "closed_loop",
     "gallery",
     "initial_guesses",
+    "ros_map",
     "scenes",
     "separation",
     "tradeoff",

@@ -52,11 +52,14 @@ def test_robot_is_imported_and_examined(tmp_path: Path, run: RunCommand) -> None
 @pytest.mark.parametrize(
     ("command", "part"),
     [
-        ("import-robot none.urdf", "cannot read the URDF, xacro, MJCF, SDF or USD"),
+        ("import-robot none.urdf", "cannot read the URDF, xacro, MJCF, SDF, USD or MoveIt .scene"),
         ("import-robot given/robot.urdf --output given", "got other files"),
         ("import-robot given/robot.urdf --package meshes", "NAME=FOLDER"),
         ("import-home none.xml", "none.xml"),
-        ("import-home binary.urdf", "expected a URDF, xacro, MJCF, SDF or USD file in UTF-8, got"),
+        (
+            "import-home binary.urdf",
+            "expected a URDF, xacro, MJCF, SDF, USD or MoveIt .scene file in UTF-8, got",
+        ),
         ("check drawer --plot it.xyz", "--plot: not the name of a picture (expected a name"),
         ("doctor husky_ur5", "did you mean 'husky_ur5e'?"),
     ],

@@ -60,14 +60,15 @@ def add_importing(commands: Any) -> None:
     _add_hand(item, most=3)
 
     about = (
-        "Import a whole home from a URDF, xacro, MJCF, SDF or USD file as a scene: fixed parts "
-        "become obstacles of convex pieces, parts with joints become objects with attachments, "
-        "and free parts become objects to carry. A room that is one mesh, such as a scan, is "
-        "divided into its floor and obstacles. The robot starts at a free pose. The report lists "
-        "changes, and parts that no hand can move."
+        "Import a whole home from a URDF, xacro, MJCF, SDF, USD or MoveIt .scene file as a scene: "
+        "fixed parts become obstacles of convex pieces, parts with joints become objects with "
+        "attachments, and free parts become objects to carry. A room that is one mesh, such as a "
+        "scan, is divided into its floor and obstacles. The robot starts at a free pose. The "
+        "report lists changes, and parts that no hand can move."
     )
     home = add_command(commands, "import-home", "import a whole home", _import_home, about)
-    add_option(home, "file FILE", "URDF, xacro, MJCF, SDF, USD, or a mesh (glTF, OBJ, PLY, STL)")
+    about = "URDF, xacro, MJCF, SDF, USD, MoveIt .scene, or a mesh (glTF, OBJ, PLY, STL)"
+    add_option(home, "file FILE", about)
     _add_output(home, "import-home")
     about = "height of the floor in the file (default 0, of a mesh its largest level surface)"
     add_option(home, "--floor METRES", about, type=float)

@@ -20,6 +20,7 @@ import pydantic
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.world.files.documents import parse_document, read_yaml
+from vkc_pin.world.scene.joint_state import JointStateSchema
 from vkc_pin.world.scene.scene import Scene
 
 _FIELDS = {"box": 3, "cylinder": 2, "sphere": 1}
@@ -65,13 +66,8 @@ class _Scene(_Part):
     world: _World = _World()
 
 
-class _Joints(_Part):
-    name: tuple[str, ...] = ()
-    position: tuple[float, ...] = ()
-
-
 class _State(_Part):
-    joint_state: _Joints = _Joints()
+    joint_state: JointStateSchema = JointStateSchema()
 
 
 class _JointGoal(_Part):
@@ -146,16 +142,7 @@ def read_problem(
         "arena": {"x": [-_ARENA, _ARENA], "y": [-_ARENA, _ARENA]},
     }
     empty = Scene.from_document(document, ".")
-    state = asked.start_state.joint_state
-    if len(state.name) != len(state.position):
-        raise InputError(
-            "wrong number",
-            file=request,
-            field="start_state.joint_state",
-            expected=f"{len(state.name)} positions",
-            got=len(state.position),
-        )
-    values = dict(zip(state.name, state.position, strict=True))
+    values = asked.start_state.joint_state.positions
     arm = empty.robot.coordinates.names[3:]
     start = {name: values[name] for name in arm if name in values}
     # Objects may be in the frame of a link of the robot at its start.

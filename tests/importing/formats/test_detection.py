@@ -24,7 +24,6 @@ OTHERS = {
     "a.bt": (b"# Octomap OcTree binary file\n\xb8", "OctoMap is not supported"),
     "a.stl": (b"solid a\nendsolid a\n", "STL is not supported"),
     "map.yaml": (b"image: m.pgm\nresolution: 0.05\n", "map of nav2.* is not supported"),
-    "s.scene": (b"room\n* box0\n1 0 0.5\n", "MoveIt .scene is not supported"),
     "s.wbt": (b"#VRML_SIM R2023b utf8\n", "Webots is not supported"),
     "readme": (b"\n  A robot.\n", "the file is not XML .*got A"),
 }

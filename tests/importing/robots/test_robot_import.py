@@ -32,6 +32,35 @@ def add_elements(*elements: str) -> tuple[str, str]:
     return "</robot>", "".join((*elements, "</robot>"))
 
 
+@pytest.mark.parametrize(
+    ("model", "base"),
+    [(None, "omni"), ("diff_drive", "differential"), ("tracked", "omni")],
+)
+def test_base_and_home_are_those_of_the_srdf(tmp_path: Path, model: str | None, base: str) -> None:
+    file = write_arms(tmp_path / "given")
+    positions = {f"arm_{k}_joint": value for k, value in enumerate((0.1, 0.2, 0.3, 0.4, 0.5), 1)}
+    joints = [f'<joint name="{name}" value="{value}"/>' for name, value in positions.items()]
+    property_text = ""
+    if model is not None:
+        names = 'joint_name="drive" property_name="motion_model"'
+        property_text = f'<joint_property {names} value="{model}"/>'
+    file.with_suffix(".srdf").write_text(
+        '<robot name="robot">'
+        '<virtual_joint name="drive" type="planar" parent_frame="odom" child_link="body"/>'
+        f'{property_text}<group name="all"><joint name="drive"/><joint name="arm_1_joint"/></group>'
+        f'<group_state name="home" group="all">{"".join(joints)}</group_state></robot>'
+    )
+    made = vkc.importing.import_robot(file, tmp_path / "mine", samples=SAMPLES)
+    scene = vkc.load_scene(made.folder / "scene.yaml")
+    assert scene.robot.base == base
+    assert dict(zip(made.robot.coordinates.names[3:], made.robot.home, strict=True)) == (
+        pytest.approx(positions)
+    )
+    report = str(made.diagnosis)
+    assert f"base: {base} (planar joint drive of the SRDF" in report
+    assert ("with an unknown motion model 'tracked') [guess]" in report) == (model == "tracked")
+
+
 @pytest.fixture(scope="module")
 def imported(tmp_path_factory: pytest.TempPathFactory) -> vkc.importing.ImportedRobot:
     """Import a robot with two arms on a mobile base, an open bin 0.35 m above the floor."""

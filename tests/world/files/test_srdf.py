@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from helpers.expected_errors import expect_error
 
-from vkc_pin.world.files.srdf import Srdf, find_srdf, read_allowed_pairs, read_srdf
+from vkc_pin.world.files.srdf import Srdf, SrdfPlanarJoint, find_srdf, read_allowed_pairs, read_srdf
 
 
 def make_urdf() -> ElementTree.Element:
@@ -102,6 +102,42 @@ def test_stale_names_are_skipped_one_by_one(tmp_path: Path) -> None:
     for name in ("arm_sc", "hook", "flange", "j_gone", "half", "whole", "ring"):
         assert name in text
     assert "world" not in text
+
+
+def format_property(joint: str, name: str, value: str) -> str:
+    return f'<joint_property joint_name="{joint}" property_name="{name}" value="{value}"/>'
+
+
+PLANAR = '<virtual_joint name="drive" type="planar" parent_frame="odom" child_link="base"/>'
+
+
+@pytest.mark.parametrize(
+    ("elements", "expected"),
+    [
+        ("", None),
+        ('<virtual_joint name="v" type="fixed" parent_frame="w" child_link="base"/>', None),
+        (PLANAR, SrdfPlanarJoint("drive")),
+        (
+            PLANAR
+            + format_property("drive", "angular_distance_weight", "1")
+            + format_property("other", "motion_model", "holonomic")
+            + format_property("drive", "motion_model", "diff_drive"),
+            SrdfPlanarJoint("drive", "diff_drive"),
+        ),
+    ],
+)
+def test_planar_joint_is_the_base(
+    tmp_path: Path, elements: str, expected: SrdfPlanarJoint | None
+) -> None:
+    assert read_text(tmp_path, elements).planar_joint == expected
+
+
+def test_places_of_the_base_in_states_are_noted(tmp_path: Path) -> None:
+    state = '<joint name="drive" value="1 2 0.5"/><joint name="j_arm" value="0.3"/>'
+    home = f'<group_state name="home" group="all">{state}</group_state>'
+    found = read_text(tmp_path, PLANAR + home)
+    assert found.states[0].positions == {"j_arm": 0.3}
+    assert found.notes == ("skipped places of the base in states: drive",)
 
 
 def test_srdf_of_another_robot_is_an_error(tmp_path: Path) -> None:

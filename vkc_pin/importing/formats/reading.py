@@ -17,6 +17,7 @@ from vkc_pin.importing.formats.detection import (
     list_formats,
 )
 from vkc_pin.importing.formats.mjcf import read_mjcf_description
+from vkc_pin.importing.formats.moveit_scene import read_moveit_scene
 from vkc_pin.importing.formats.sdf import read_sdf_description
 from vkc_pin.importing.formats.urdf import read_urdf_description
 from vkc_pin.importing.formats.usd import read_usd_description
@@ -42,6 +43,7 @@ _READERS: Mapping[str, Callable[[Path, Folders, Arguments], Description]] = {
     "MJCF": lambda file, packages, _: read_mjcf_description(file),
     "SDF": lambda file, packages, _: read_sdf_description(file, packages),
     "USD": lambda file, packages, _: read_usd_description(file, packages),
+    "MoveIt .scene": lambda file, *_: read_moveit_scene(file),
 }
 """Reader of each format; `detect_format` names the formats."""
 FORMATS = list_formats(_READERS)

@@ -120,7 +120,7 @@ def import_home(  # noqa: PLR0913 - keyword options of a public call
     packages: Mapping[str, str | Path] | None = None,
     arguments: Mapping[str, str] | None = None,
 ) -> ImportedHome:
-    """Import a URDF, xacro, MJCF, SDF or USD file, or a mesh, of a whole home as a scene.
+    """Import a URDF, xacro, MJCF, SDF, USD or MoveIt .scene file, or a mesh, of a home as a scene.
 
     Fixed links become obstacles of convex pieces. A fixed link with joints becomes an articulated
     object, for whose joints attachments are proposed. Floating links become free objects. The arena

@@ -80,6 +80,8 @@ _FINGERS = "in robot.yaml: `gripper: {FINGER_JOINT: {closed: POSITION, open: POS
 # Joints after which links belong to an arm or its hand; a chain of one more is an arm.
 _AT_END = 3
 _STANDING = 0.005  # [m] height up to which a root stands on the floor
+_MOTION_MODELS = {"holonomic": "omni", "diff_drive": "differential"}
+"""Motion model of an SRDF's planar joint → kind of base."""
 _NO_WHEELS = "no wheels: an omnidirectional base is assumed; use `fixed` for an arm on a table"
 
 
@@ -311,6 +313,17 @@ class _Importer:
 
     def _set_base(self, drive: Drive | None) -> None:
         hint = "if it is wrong: `base` in scene.yaml and other scenes"
+        planar = self._source.srdf.planar_joint
+        if planar is not None and (planar.motion_model or drive is None):
+            # Without a motion model MoveIt takes the joint for holonomic; wheels may say more.
+            model = planar.motion_model or "holonomic"
+            why = f"planar joint {planar.name} of the SRDF"
+            if model not in _MOTION_MODELS:
+                why += f" with an unknown motion model '{model}'"
+            self._base = _MOTION_MODELS.get(model, "omni")
+            sure = "sure" if model in _MOTION_MODELS else "guess"
+            self._guess(sure, f"base: {self._base} ({why})", hint)
+            return
         if drive is None:
             self._base = "omni"
             self._guess("guess", f"base: {self._base} ({_NO_WHEELS})", hint)

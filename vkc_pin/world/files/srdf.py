@@ -40,6 +40,19 @@ class SrdfState:
 
 
 @dataclass(frozen=True)
+class SrdfPlanarJoint:
+    """A virtual joint on which the robot drives.
+
+    Attributes:
+        name: Its name.
+        motion_model: "holonomic" or "diff_drive"; None if the file states none.
+    """
+
+    name: str
+    motion_model: str | None = None
+
+
+@dataclass(frozen=True)
 class AllowedPairs:
     """Allowed collisions of an SRDF.
 
@@ -60,12 +73,14 @@ class Srdf:
         allowed: Sorted pair of links that may collide → reason.
         states: Named configurations, in the order of the file.
         groups: Groups with joints, by name.
+        planar_joint: The first `virtual_joint` of type "planar", if there is one.
         notes: Skipped elements.
     """
 
     allowed: dict[Pair, str] = field(default_factory=dict)
     states: tuple[SrdfState, ...] = ()
     groups: dict[str, SrdfGroup] = field(default_factory=dict)
+    planar_joint: SrdfPlanarJoint | None = None
     notes: tuple[str, ...] = ()
 
     def find_states(
@@ -199,9 +214,28 @@ def read_srdf(path: str | Path, urdf: ElementTree.Element) -> Srdf:
     for kind, names in (("links", list(unknown_links)), ("joints", sorted(unknown_joints))):
         if names:
             notes.append(f"skipped {kind} that the robot does not have: {format_names(names)}")
+    placing = sorted(virtual_joints.intersection(unknown_in_states))
+    if placing:
+        # A scene states where the robot starts.
+        notes.append(f"skipped places of the base in states: {format_names(placing)}")
     if groups.invalid:
         notes.append(f"skipped groups of groups that are missing: {format_names(groups.invalid)}")
-    return Srdf(pairs.allowed, states, groups.groups, tuple(notes))
+    planar_joint = _read_planar_joint(root)
+    return Srdf(pairs.allowed, states, groups.groups, planar_joint, tuple(notes))
+
+
+def _read_planar_joint(root: ElementTree.Element) -> SrdfPlanarJoint | None:
+    """Return the first planar virtual joint, with the motion model of its `joint_property`."""
+    for element in root.findall("virtual_joint"):
+        if element.get("type", "").strip() != "planar":
+            continue
+        name = element.get("name", "").strip()
+        for item in root.findall("joint_property"):
+            is_own = item.get("joint_name", "").strip() == name
+            if is_own and item.get("property_name", "").strip() == "motion_model":
+                return SrdfPlanarJoint(name, item.get("value", "").strip())
+        return SrdfPlanarJoint(name)
+    return None
 
 
 def _find_link_references(root: ElementTree.Element) -> set[str]:

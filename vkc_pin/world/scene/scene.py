@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import pinocchio as pin
@@ -79,9 +79,10 @@ class Scene:
             hand.
         obstacles: Fixed obstacles as convex shapes: parent joint 0, placement in the world frame,
             colour set. An obstacle of one shape has its name, one of several shapes
-            `<name>_<number>`. The floor is among them.
-        obstacle_labels: Name of the obstacle of each of these shapes (`FLOOR` for the floor).
-        obstacle_names: Names of the obstacles in the order of the file, without the floor.
+            `<name>_<number>`. The floor and the boxes of the map are among them.
+        obstacle_labels: Name of the obstacle of each of these shapes (`FLOOR` for the floor, `MAP`
+            for the map).
+        obstacle_names: Names of the obstacles in the order of the file, without floor and map.
         obstacle_visual: Visual shapes of the obstacles, without the floor.
         obstacle_visual_labels: Name of the obstacle of each of these shapes.
         floor: Whether there is a floor at z = 0.
@@ -238,6 +239,32 @@ class Scene:
         start_velocity = make_robot_velocity(self.robot, start, wanted)
         return self._with(start=start, start_velocity=start_velocity)
 
+    def with_joint_state(self, message: Mapping[str, Any]) -> Scene:
+        """Return the scene with the start that a message of ROS or MoveIt states.
+
+        Names may have any order. Joints that the message lacks keep their start, others that are
+        not planned (wheels, fingers, followers) are named in a warning. Velocities and efforts are
+        not used; see `with_start` for velocities.
+
+        Args:
+            message: Mapping with the fields of `sensor_msgs/JointState` (`name`, `position`) or of
+                `moveit_msgs/RobotState`, whose `multi_dof_joint_state` with one joint is the base
+                in the frame of the scene. `rosidl_runtime_py.message_to_ordereddict` makes it of a
+                message.
+
+        Raises:
+            InputError: A field is missing or invalid, the base is tilted, or a value is outside its
+                limits or the arena.
+        """
+        from vkc_pin.world.scene.joint_state import note_other_joints, parse_joint_state
+
+        state = parse_joint_state(message)
+        names = self.robot.coordinates.names[3:]
+        arm = {name: state.positions[name] for name in names if name in state.positions}
+        for note in (*state.notes, *note_other_joints(state.positions, names)):
+            warnings.warn(f"{self.name}: {note}", stacklevel=2)
+        return self.with_start(state.base, arm)
+
     def _check_start_values(self, values: ArrayLike, field: str, part: slice) -> list[float]:
         """Return the values of a `part` of the coordinates at the start."""
         given = check_array(values, field)
@@ -348,6 +375,43 @@ class Scene:
         pose = as_placement(placement, name="placement")
         # Results in `memory` depend on the obstacles: the copy begins with none.
         return dataclasses.replace(self, **move_obstacle(vars(self), name, pose))
+
+    def with_map(
+        self,
+        file: str | Path,
+        *,
+        height: float = 2.0,
+        unknown: Literal["blocked", "free"] = "blocked",
+    ) -> Scene:
+        """Return the scene on an occupancy map of ROS, whose occupied cells become obstacles.
+
+        The map replaces an earlier one. The arena remains if it was stated and is within the
+        bounding box of the map, which it becomes otherwise. The start must be in it.
+
+        Args:
+            file: A `map.yaml` of map_server or Nav2.
+            height: Height of the obstacles above the floor [m].
+            unknown: Whether cells that are neither occupied nor free are "blocked" as well, or
+                "free". Parts of the arena beyond the image are unknown.
+
+        Raises:
+            InputError: A file cannot be read, an argument is invalid, or the start is outside.
+        """
+        path = check_path(file, "file", "the path of a map.yaml")
+        document = self.document
+        entry = {"file": str(path.absolute()), "height": height, "unknown": unknown}
+        document["map"] = entry
+        arena = document.pop("arena")
+        on_map = Scene.from_document(document, self.folder)
+        x_min, x_max, y_min, y_max = on_map.arena
+        is_stated = self.described.arena is not None
+        is_within = (
+            x_min <= self.arena[0] <= self.arena[1] <= x_max
+            and y_min <= self.arena[2] <= self.arena[3] <= y_max
+        )
+        if not (is_stated and is_within):
+            return on_map
+        return Scene.from_document({**document, "arena": arena}, self.folder)
 
     def with_held(
         self,

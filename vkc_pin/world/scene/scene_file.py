@@ -35,6 +35,7 @@ from vkc_pin.world.scene.hold import (
     place_held_objects,
     resolve_holds,
 )
+from vkc_pin.world.scene.map_obstacles import MAP, MapObstacle
 from vkc_pin.world.scene.obstacles import (
     FLOOR,
     make_floor_shape,
@@ -54,7 +55,8 @@ def make_scene_fields(document: Document, folder: Path) -> dict[str, Any]:
     for index, placed_item in enumerate(description.objects):
         placed = _load_object(document, ("objects", index), placed_item, folder)
         objects[placed_item.name] = placed
-    arena = (*description.arena.x, *description.arena.y)
+    map_obstacle = _load_map(document, description.map, folder)
+    arena = _make_arena(description.arena, map_obstacle)
     obstacles = list[pin.GeometryObject]()
     labels = list[str]()
     visual = list[pin.GeometryObject]()
@@ -65,6 +67,13 @@ def make_scene_fields(document: Document, folder: Path) -> dict[str, Any]:
         visual_labels += [item.name] * len(visual_shapes)
         obstacles += shapes
         labels += [item.name] * len(shapes)
+    if map_obstacle is not None:
+        with document.annotate_errors(("map",)):
+            map_shapes = map_obstacle.make_shapes(arena)
+        visual += map_shapes
+        visual_labels += [MAP] * len(map_shapes)
+        obstacles += map_shapes
+        labels += [MAP] * len(map_shapes)
     if description.floor:
         obstacles.append(make_floor_shape(arena))
         labels.append(FLOOR)
@@ -108,7 +117,7 @@ def make_document(fields: Mapping[str, Any]) -> dict[str, Any]:
     objects = fields["objects"]
     region = fields["start_region"]
     plain = described.model_dump(
-        mode="json", include={"robot", "obstacles", "objects", "allow"}, exclude_none=True
+        mode="json", include={"robot", "map", "obstacles", "objects", "allow"}, exclude_none=True
     )
     held = {hold.object: _describe_hold(hold, objects) for hold in fields["holds"]}
     for item, entry in zip(described.objects, plain["objects"], strict=True):
@@ -136,6 +145,8 @@ def make_document(fields: Mapping[str, Any]) -> dict[str, Any]:
         intervals = {key: list(value) for key, value in vars(region).items() if value}
         document["start_region"] = intervals
     document["floor"] = fields["floor"]
+    if described.map is not None:
+        document["map"] = plain["map"]
     document["obstacles"] = plain["obstacles"]
     document["objects"] = plain["objects"]
     if plain["allow"]:
@@ -263,6 +274,28 @@ def _update_measured_joints(
         entry["measured"] = joints
 
 
+def _load_map(
+    document: Document, item: schema.MapSchema | None, folder: Path
+) -> MapObstacle | None:
+    if item is None:
+        return None
+    is_short = isinstance(document.data["map"], str)  # map: map.yaml
+    path = ("map",) if is_short else ("map", "file")
+    _find_file(document, path, folder, item.file)
+    with document.annotate_errors(path):
+        return MapObstacle(item, folder)
+
+
+def _make_arena(
+    item: schema.ArenaSchema | None, map_obstacle: MapObstacle | None
+) -> tuple[float, float, float, float]:
+    """Return the stated arena, else that of the map, else the default, as in `Scene.arena`."""
+    if item is None and map_obstacle is not None:
+        return map_obstacle.bounds
+    stated = schema.ArenaSchema() if item is None else item
+    return (*stated.x, *stated.y)
+
+
 def _load_robot(document: Document, description: schema.SceneSchema, folder: Path) -> Robot:
     item = description.robot
     is_path = item.name.endswith((".urdf", ".yaml", ".yml")) or "/" in item.name
@@ -279,6 +312,8 @@ def _load_robot(document: Document, description: schema.SceneSchema, folder: Pat
 
 def _check_unique_names(document: Document, description: schema.SceneSchema) -> None:
     used = {FLOOR: "the floor"}
+    if description.map is not None:
+        used[MAP] = "the map"
     for group, items in (("obstacles", description.obstacles), ("objects", description.objects)):
         for index, item in enumerate(items):
             path = (group, index, "name")
@@ -475,6 +510,8 @@ def _list_labels(
         labels[name] = own_labels
     for item in description.obstacles:
         labels[item.name] = [item.name]
+    if description.map is not None:
+        labels[MAP] = [MAP]
     if description.floor:
         labels[FLOOR] = [FLOOR]
     # In an SRDF, the name of a link stands for it without its object if it is the only one.

@@ -272,6 +272,17 @@ class ArenaSchema(Schema):
     y: Interval = (-5.0, 5.0)
 
 
+class MapSchema(Schema):
+    """An occupancy map: the file of a `map.yaml`, and the height of obstacles on its cells [m].
+
+    `unknown` says whether cells that are neither occupied nor free are obstacles, too.
+    """
+
+    file: str
+    height: Positive = 2.0
+    unknown: Literal["blocked", "free"] = "blocked"
+
+
 class RegionSchema(Schema):
     """The region of random starts: intervals of x, y [m] and heading [rad] (None: any)."""
 
@@ -315,14 +326,18 @@ class AllowSchema(Schema):
 
 
 class SceneSchema(Schema):
-    """A scene file."""
+    """A scene file.
+
+    Without an arena, it is the bounding box of the map, or `ArenaSchema`'s default.
+    """
 
     name: Name | None = None
     robot: Annotated[SceneRobotSchema, wrap_text("name")]
     start: StartSchema
-    arena: ArenaSchema = ArenaSchema()
+    arena: ArenaSchema | None = None
     start_region: RegionSchema | None = None
     floor: bool = True
+    map: Annotated[MapSchema | None, wrap_text("file")] = None
     obstacles: Annotated[tuple[ObstacleSchema, ...], Field(max_length=_MAX_OBSTACLES)] = ()
     objects: tuple[PlacedObjectSchema, ...] = ()
     allow: tuple[Annotated[AllowSchema, BeforeValidator(_parse_allow)], ...] = ()

@@ -13,7 +13,7 @@ import pytest
 from helpers.expected_errors import expect_error
 from helpers.fake_plan import make_fake_plan
 from rosbags.rosbag2 import Reader
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from vkc_pin import Plan
 from vkc_pin.world.trajectory.curve import Curve
@@ -36,6 +36,12 @@ def plan() -> Plan:
 def read_bag(folder: Path) -> Messages:
     """Return topic → messages with their recording times [ns]."""
     store = get_typestore(Stores.ROS2_HUMBLE)
+    # As moveit_msgs 2.2 defines it.
+    text = (
+        "trajectory_msgs/JointTrajectory joint_trajectory\n"
+        "trajectory_msgs/MultiDOFJointTrajectory multi_dof_joint_trajectory\n"
+    )
+    store.register(get_types_from_msg(text, "moveit_msgs/msg/RobotTrajectory"))
     found: Messages = {}
     with Reader(folder) as reader:
         for connection, stamp, data in reader.messages():
@@ -68,6 +74,38 @@ def test_trajectories_equal_those_of_to_ros(plan: Plan, tmp_path: Path) -> None:
         assert convert_message(message) == plan.to_ros(
             joints=group, rate=100.0, frame="map", stamp=1.25
         )
+
+
+def test_robot_trajectory_has_arm_and_planar_base(plan: Plan, tmp_path: Path) -> None:
+    options: dict[str, Any] = {"rate": 50.0, "frame": "odom", "stamp": 2.5}
+    bag = plan.to_rosbag(tmp_path / "bag", base_joint="virtual_joint", **options)
+    ((recorded, message),) = read_bag(bag)["/vkc/robot_trajectory"]
+    assert recorded == 2_500_000_000
+    arm = convert_message(message.joint_trajectory)
+    assert arm == plan.to_ros(joints="arm", **options)
+    base = message.multi_dof_joint_trajectory
+    assert list(base.joint_names) == ["virtual_joint"]
+    assert base.header.frame_id == "odom"
+    assert convert_message(base.header) == arm["header"]
+    motion = plan.trajectory
+    times = [read_time(point.time_from_start) for point in base.points]
+    assert times == [read_time(point.time_from_start) for point in message.joint_trajectory.points]
+    for time, point in zip(times, base.points, strict=True):
+        (transform,) = point.transforms
+        (twist,) = point.velocities
+        x, y, yaw = motion.at(time)[:3]
+        move = transform.translation
+        turn = transform.rotation
+        np.testing.assert_allclose([move.x, move.y, move.z], [x, y, 0.0], atol=1e-7)
+        np.testing.assert_allclose(
+            [turn.x, turn.y, turn.z, turn.w],
+            [0.0, 0.0, np.sin(yaw / 2.0), np.cos(yaw / 2.0)],
+            atol=1e-7,
+        )
+        # Rates of x, y and yaw in the world, as MoveIt reads them.
+        rates = [twist.linear.x, twist.linear.y, twist.angular.z]
+        np.testing.assert_allclose(rates, motion.velocity(time)[:3], atol=1e-6)
+        assert len(point.accelerations) == 0
 
 
 def test_base_velocities_follow_the_path(plan: Plan, tmp_path: Path) -> None:
@@ -129,6 +167,7 @@ def test_existing_folder_is_replaced_only_with_force(plan: Plan, tmp_path: Path)
         ({"states": -1.0}, "states"),
         ({"namespace": "/a b"}, "namespace"),
         ({"frame": 1}, "frame"),
+        ({"base_joint": 1}, "base_joint"),
         ({"states": 1e9}, "states"),
         ({"stamp": 2.0**31 - 5.0}, "stamp"),  # the motion takes 6 s
     ],

@@ -26,12 +26,18 @@ from vkc_pin.world.trajectory.formats.ros import MOST_SECONDS, sample_states, to
 TOPICS: Mapping[str, str] = {
     "arm/joint_trajectory": "trajectory_msgs/msg/JointTrajectory",
     "base/joint_trajectory": "trajectory_msgs/msg/JointTrajectory",
+    "robot_trajectory": "moveit_msgs/msg/RobotTrajectory",
     "base/path": "nav_msgs/msg/Path",
     "base/cmd_vel": "geometry_msgs/msg/TwistStamped",
     "objects/joint_states": "sensor_msgs/msg/JointState",
     "phases": "std_msgs/msg/String",
 }
 """Recorded topics: suffix of the topic name → message type."""
+ROBOT_TRAJECTORY = """\
+trajectory_msgs/JointTrajectory joint_trajectory
+trajectory_msgs/MultiDOFJointTrajectory multi_dof_joint_trajectory
+"""
+"""Definition of MoveIt's message type `RobotTrajectory`, which rosbags does not know."""
 _FORMAT = 8  # of rosbag2, the last that older readers accept
 _NANO = 1_000_000_000
 
@@ -45,14 +51,17 @@ def write_rosbag(
     namespace: str = "/vkc",
     frame: str = "world",
     base_frame: str = "base_link",
+    base_joint: str = "world_joint",
     stamp: float = 0.0,
     force: bool = False,
 ) -> Path:
     """Write a motion as a ROS 2 bag, a folder with metadata.yaml and a database; return its path.
 
     Trajectories and the path are single messages at the beginning. Velocities of the base, in its
-    own frame, and joint states of objects follow at a rate. "phases" states as JSON, where each
-    phase begins, its holds and gripper opening. Topics of absent parts (arm, objects) are left out.
+    own frame, and joint states of objects follow at a rate. "robot_trajectory" is arm and base as
+    MoveIt states them: the base is a joint of several degrees of freedom. "phases" states as JSON,
+    where each phase begins, its holds and gripper opening. Topics of absent parts (arm, objects)
+    are left out.
 
     Args:
         motion: Motion.
@@ -62,6 +71,8 @@ def write_rosbag(
         namespace: Beginning of the topic names.
         frame: `header.frame_id`, the frame of the base's coordinates.
         base_frame: `header.frame_id` of the base's velocities.
+        base_joint: Name of the base's planar joint in "robot_trajectory": that of the SRDF's
+            `virtual_joint`.
         stamp: `header.stamp` of the trajectories, at which the recording begins [s].
         force: Whether to replace an existing folder.
 
@@ -71,15 +82,22 @@ def write_rosbag(
     """
     import_rosbags()
     from rosbags.rosbag2 import Writer
-    from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     states = check_number(states, "states", "messages a second, more than 0", low=0.0, strict=True)
     prefix = _check_namespace(namespace)
     store: Any = get_typestore(Stores.ROS2_HUMBLE)
-    base_frame = check_text(base_frame, "base_frame")
+    store.register(get_types_from_msg(ROBOT_TRAJECTORY, TOPICS["robot_trajectory"]))
     messages = list(
         _make_messages(
-            motion, store.types, rate, states, frame=frame, base_frame=base_frame, stamp=stamp
+            motion,
+            store.types,
+            rate,
+            states,
+            frame=frame,
+            base_frame=check_text(base_frame, "base_frame"),
+            base_joint=check_text(base_joint, "base_joint"),
+            stamp=stamp,
         )
     )
     messages.sort(key=lambda message: message.time)
@@ -143,6 +161,7 @@ def _make_messages(
     *,
     frame: str,
     base_frame: str,
+    base_joint: str,
     stamp: float,
 ) -> Iterator[_Message]:
     base = to_ros(motion, joints="base", rate=rate, frame=frame, stamp=stamp)
@@ -157,6 +176,10 @@ def _make_messages(
         yield _Message("arm/joint_trajectory", begin, _make_trajectory(types, arm))
     if base["joint_names"]:
         yield _Message("base/joint_trajectory", begin, _make_trajectory(types, base))
+    whole = types[TOPICS["robot_trajectory"]](
+        _make_trajectory(types, arm), _make_base_trajectory(types, base, base_joint)
+    )
+    yield _Message("robot_trajectory", begin, whole)
     yield _Message("base/path", begin, _make_path(types, base["points"], begin, frame))
     _, times, positions, velocities = sample_states(motion, "base", states)
     for time, pose, velocity in zip(times, positions, velocities, strict=True):
@@ -195,6 +218,41 @@ def _make_trajectory(types: Any, data: Mapping[str, Any]) -> Any:
     stamp = _count_nanoseconds(data["header"]["stamp"])
     header = _make_header(types, stamp, data["header"]["frame_id"])
     return types["trajectory_msgs/msg/JointTrajectory"](header, data["joint_names"], points)
+
+
+def _make_base_trajectory(types: Any, data: Mapping[str, Any], joint: str) -> Any:
+    """Return the motion of the base as that of a planar joint.
+
+    As MoveIt has it, velocities and accelerations are those of x, y and yaw, in the frame of the
+    poses and not in that of the base.
+    """
+    make_point = types["trajectory_msgs/msg/MultiDOFJointTrajectoryPoint"]
+    make_duration = types["builtin_interfaces/msg/Duration"]
+    make_vector = types["geometry_msgs/msg/Vector3"]
+    make_transform = types["geometry_msgs/msg/Transform"]
+    make_twist = types["geometry_msgs/msg/Twist"]
+
+    def make_rates(rates: Sequence[float]) -> list[Any]:
+        if not rates:
+            return []
+        x, y, yaw = rates
+        return [make_twist(make_vector(x, y, 0.0), make_vector(0.0, 0.0, yaw))]
+
+    points = []
+    for point in data["points"]:
+        pose = _make_pose(types, point)
+        x, y, _ = point["positions"]
+        transform = make_transform(make_vector(x, y, 0.0), pose.orientation)
+        numbers = make_point(
+            [transform],
+            make_rates(point["velocities"]),
+            make_rates(point["accelerations"]),
+            make_duration(**point["time_from_start"]),
+        )
+        points.append(numbers)
+    stamp = _count_nanoseconds(data["header"]["stamp"])
+    header = _make_header(types, stamp, data["header"]["frame_id"])
+    return types["trajectory_msgs/msg/MultiDOFJointTrajectory"](header, [joint], points)
 
 
 def _make_path(types: Any, points: Sequence[Mapping[str, Any]], begin: int, frame: str) -> Any:

@@ -60,7 +60,13 @@ def make_kitchen_spec(text: str = KITCHEN) -> Any:
 
 
 def make_kitchen(
-    robot: str = "husky_ur5e", *, text: str = KITCHEN, base: str = "omni", prefix: str = ""
+    robot: str = "husky_ur5e",
+    *,
+    text: str = KITCHEN,
+    base: str = "omni",
+    prefix: str = "",
+    mount: np.ndarray | None = None,
+    axes: np.ndarray | None = None,
 ) -> Any:
     """Return the compiled model of a kitchen with a robot on servos.
 
@@ -71,6 +77,8 @@ def make_kitchen(
         text: The kitchen.
         base: Type of the base.
         prefix: Prefix of all names of the robot.
+        mount: Place of the base's joints in the world: x, y, z [m] and yaw [rad], shape (4,).
+        axes: Axes of the base's joints there, shape (3, 3).
     """
     document = {
         "robot": {"name": robot, "base": base},
@@ -105,6 +113,12 @@ def make_kitchen(
     weld.name2 = "home/drawer"
     weld.data = [0.0] * len(weld.data)
     weld.data[10] = 1.0
+    if mount is not None:
+        first = spec.body("body 1")
+        first.pos = mount[:3]
+        first.quat = [np.cos(mount[3] / 2.0), 0.0, 0.0, np.sin(mount[3] / 2.0)]
+    for name, axis in zip(world.coordinates.names, () if axes is None else axes, strict=False):
+        spec.joint(name).axis = axis
     if prefix:
         for joint in spec.joints:
             if joint.name in world.coordinates.names:

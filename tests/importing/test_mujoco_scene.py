@@ -193,6 +193,49 @@ def test_joints_with_other_names() -> None:
     assert elevation == pytest.approx(0.0, abs=1e-9)
 
 
+@given(
+    mount=st.tuples(*[st.floats(-2.0, 2.0)] * 3, angles),
+    signs=st.tuples(*[st.sampled_from([-1.0, 1.0])] * 3),
+    swaps=st.booleans(),
+    qpos=st.tuples(st.floats(-2.0, 2.0), st.floats(-2.0, 2.0), angles),
+)
+@settings(max_examples=10, deadline=None)
+def test_base_is_found_wherever_its_joints_are(
+    mount: tuple[float, ...], signs: tuple[float, ...], swaps: bool, qpos: tuple[float, ...]
+) -> None:
+    axes = np.diag(signs)
+    if swaps:
+        axes[[0, 1]] = axes[[1, 0]]
+    model = make_kitchen(mount=np.array(mount), axes=axes)
+    data = make_data(model)
+    robot = vkc.load_robot(ROBOT)
+    found = RobotInModel(model, robot, ModelJoints(model, None))
+    motion = found.find_base_motion(data)
+    data.qpos[:3] = qpos
+    mujoco.mj_kinematics(model, data)
+    pose, elevation = found.find_base(data)
+    assert elevation == pytest.approx(mount[2], abs=1e-9)
+    back = motion.invert(pose[None])[0]
+    turns = (back[2] - qpos[2]) / (2.0 * np.pi)
+    assert back[:2] == pytest.approx(qpos[:2], abs=1e-9)
+    assert turns == pytest.approx(round(turns), abs=1e-9)
+    # The robot's own kinematics agree with MuJoCo's there.
+    z = np.array([*pose, *robot.home])
+    kinematics = robot.model.createData()
+    pin.framesForwardKinematics(robot.model, kinematics, robot.coordinates.q(z))
+    tool = kinematics.oMf[robot.model.getFrameId(robot.tool_frame)].translation
+    assert data.body("tool").xpos == pytest.approx(tool + [0.0, 0.0, elevation], abs=1e-9)
+
+
+def test_bases_that_do_not_stay_level_are_refused() -> None:
+    model = make_kitchen(axes=np.array([[1.0, 0.0, 0.0], [0.0, 0.6, 0.8], [0.0, 0.0, 1.0]]))
+    found = RobotInModel(model, vkc.load_robot(ROBOT), ModelJoints(model, None))
+    with pytest.raises(vkc.InputError, match="does not move as x, y and yaw"):
+        found.find_base_motion(make_data(model))
+    tilted = make_kitchen(axes=np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 1.0, 1.0]]))
+    check_error(tilted, make_data(tilted), "is not upright in the model")
+
+
 # Misuse
 
 
@@ -308,6 +351,43 @@ def grip(model: Any, data: Any, weld: int) -> None:
     model.eq_data[weld][3:6] = position
     model.eq_data[weld][6:10] = orientation
     data.eq_active[weld] = 1
+
+
+def test_a_grasped_free_body_moves_with_the_hand(model: Any) -> None:
+    data = make_data(model)
+    data.qpos[:3] = [-0.4, 0.9, 1.57]
+    scene = vkc.scene_from_mujoco(model, data, robot=ROBOT, floor=-0.1, objects=["home/cup"])
+    # The cup stands on a table of 0.7 m: it is grasped where the hand finds it.
+    plan = vkc.plan(scene, [vkc.Grasp("home_cup"), vkc.GoTo(-0.6, 0.6, 1.2)])
+    assert plan.success, plan.summary()
+    motion = plan.to_mujoco(model, 20.0, data=data)
+    before = None
+    for qpos, holds in zip(motion.qpos, motion.holding, strict=True):
+        data.qpos[:] = qpos
+        mujoco.mj_kinematics(model, data)
+        tool = data.body("tool")
+        cup = data.body("home/cup")
+        if not holds:
+            assert cup.xpos == pytest.approx([-0.4, 2.1, 0.76], abs=1e-6)
+            continue
+        # In the frame of the hand.
+        relative = tool.xmat.reshape(3, 3).T @ (cup.xpos - tool.xpos)
+        before = relative if before is None else before
+        assert relative == pytest.approx(before, abs=1e-5)
+    assert before is not None
+
+
+def test_fixed_base_stands_where_the_scene_has_it(model: Any) -> None:
+    data = make_data(model)
+    data.qpos[:3] = [-0.7, 0.1, 0.4]
+    scene = vkc.scene_from_mujoco(model, data, robot=ROBOT, base="fixed", objects=["home/drawer"])
+    assert scene.start[:3] == pytest.approx([-0.7, 0.1, 0.4], abs=1e-9)
+    plan = vkc.plan(scene, [vkc.Configure({"wrist_3_joint": 0.5})])
+    motion = plan.to_mujoco(model, 20.0, data=data)
+    assert motion.driven == vkc.load_robot(ROBOT).coordinates.names[3:]
+    assert motion.qpos[:, :3] == pytest.approx(np.tile([-0.7, 0.1, 0.4], (len(motion.times), 1)))
+    with pytest.raises(vkc.InputError, match="stands elsewhere in the model"):
+        plan.to_mujoco(model, 20.0)
 
 
 def test_motion_of_another_model(plan: vkc.Plan) -> None:

@@ -190,7 +190,7 @@ class _Writer:
         gap[2] = np.arctan2(np.sin(gap[2]), np.cos(gap[2]))
         if np.abs(gap).max() > _BASE_TOLERANCE:
             raise InputError(
-                f"the base of robot '{self._scene.robot.name}' stands elsewhere in the model and its data",
+                f"the base of robot '{self._scene.robot.name}' stands elsewhere in this state",
                 field="data",
                 expected=f"x, y, yaw = {rows[0, :3].round(4).tolist()}",
                 got=pose.round(4).tolist(),

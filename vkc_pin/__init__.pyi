@@ -10,6 +10,7 @@ from . import (
     visualization,
 )
 from .errors import BuildError, InputError, UnknownNameError, VkcError
+from .importing.mujoco_scene import scene_from_mujoco
 from .options import Options
 from .planning.chain.chain import VirtualKinematicChain, consolidate, invert
 from .planning.inverse_kinematics import inverse_kinematics
@@ -106,6 +107,7 @@ __all__ = [
     "prepare",
     "procedural",
     "replan",
+    "scene_from_mujoco",
     "simulation",
     "validate",
     "validation",

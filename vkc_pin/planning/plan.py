@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     import pinocchio as pin
 
     from vkc_pin.planning.plan_schema import PlanSchema
+    from vkc_pin.simulation.mujoco_motion import MujocoMotion
     from vkc_pin.simulation.result import SimulationResult
 
 
@@ -276,6 +277,47 @@ class Plan:
         from vkc_pin.simulation.execution import simulate
 
         return simulate(self.scene, self.steps, self.trajectory, **options)
+
+    def to_mujoco(
+        self,
+        model: Any,
+        rate: float,
+        *,
+        data: Any = None,
+        joints: Mapping[str, str] | None = None,
+        robot_body: str | None = None,
+    ) -> MujocoMotion:
+        """Return the motion in the coordinates of a MuJoCo model. Extra: `sim`.
+
+        Names and order are those of the model, such as one that `scene_from_mujoco` has read. The
+        last sample is the goal. Joints of objects move as planned, in `qpos` alone.
+
+        Args:
+            model: The `mujoco.MjModel`.
+            rate: Samples a second [Hz]; the end is one more.
+            data: `mujoco.MjData` with the positions and controls of all that does not move;
+                defaults to `model.qpos0` and 0.
+            joints: Coordinate of the robot, finger, or "<object>.<joint>" → name of the model's
+                joint, for names that differ.
+            robot_body: Body that carries the robot; see `scene_from_mujoco`.
+
+        Raises:
+            UnknownNameError: A coordinate has no joint in the model, or `joints` names none.
+            InputError: The plan is no success, MuJoCo is not installed, or the model has another
+                robot, or has it elsewhere.
+        """
+        from vkc_pin.simulation.mujoco_motion import make_mujoco_motion
+
+        self.check_success()
+        return make_mujoco_motion(
+            self.scene,
+            self.trajectory,
+            model,
+            rate,
+            data=data,
+            joints=joints,
+            robot_body=robot_body,
+        )
 
     def pose(self, frame: str | None, time: float) -> pin.SE3:
         """Return where a frame is at a time of the motion, in the world frame.

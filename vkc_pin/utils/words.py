@@ -1,8 +1,15 @@
-"""Divides names of links and joints into words."""
+"""Cleans names of links and joints, and divides them into words."""
 
 from __future__ import annotations
 
 import re
+
+
+def clean_name(text: str) -> str:
+    """Return a name that scenes accept: unprintable characters, ".", "/" and spaces become "_"."""
+    plain = re.sub(r"[\s./]+", "_", text)
+    printable = "".join(letter if letter.isprintable() else "_" for letter in plain)
+    return printable.strip("_") or "part"
 
 
 def list_words(text: str) -> frozenset[str]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -51,8 +51,76 @@ def read_mjcf_description(file: Path) -> Description:
     return _Reader(mujoco, model, data, file, notes).read()
 
 
+class CompiledModel(NamedTuple):
+    """A compiled model as it was read.
+
+    Attributes:
+        description: Its description.
+        positions: Positions of hinges and slides by name, relative to `model.qpos0`, [rad] or [m].
+        bodies: Link of each body.
+    """
+
+    description: Description
+    positions: dict[str, float]
+    bodies: tuple[str, ...]
+
+
+def read_compiled_model(model: Any, data: Any) -> CompiledModel:
+    """Read a compiled model, and the positions of its joints.
+
+    The description is that of `read_mjcf_description`, but bodies whose geoms collide with nothing
+    have no shapes, and free bodies, ball joints and mocap bodies are where `data` has them.
+
+    Args:
+        model: The `mujoco.MjModel`.
+        data: Its `mujoco.MjData`, of which `qpos`, `mocap_pos` and `mocap_quat` are read.
+    """
+    mujoco = import_optional("mujoco", "sim", purpose="reading a compiled model")
+    scalar = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+    at_zero = mujoco.MjData(model)
+    at_zero.qpos[:] = data.qpos
+    at_zero.mocap_pos[:] = data.mocap_pos
+    at_zero.mocap_quat[:] = data.mocap_quat
+    addresses = dict[int, int]()  # in `qpos` of each hinge and slide
+    for joint in range(model.njnt):
+        if int(model.jnt_type[joint]) in scalar:
+            addresses[joint] = int(model.jnt_qposadr[joint])
+    for address in addresses.values():
+        at_zero.qpos[address] = model.qpos0[address]
+    mujoco.mj_kinematics(model, at_zero)
+    name = bytes(model.names).split(b"\0", 1)[0].decode() or "model"
+    reader = _Reader(mujoco, model, at_zero, Path(name), [], ghosts=False)
+    positions = dict[str, float]()
+    for joint, address in addresses.items():
+        positions[reader.find_joint_name(joint)] = float(data.qpos[address] - model.qpos0[address])
+    return CompiledModel(reader.read(), positions, reader.bodies)
+
+
 class _Reader:
-    def __init__(self, mujoco: Any, model: Any, data: Any, file: Path, notes: list[str]) -> None:
+    """Reads a compiled model.
+
+    Args:
+        mujoco: The package.
+        model: The `mujoco.MjModel`.
+        data: Its `mujoco.MjData`, whose kinematics are computed, with hinges and slides at
+            `model.qpos0`.
+        file: The file, for messages.
+        notes: Notes, to which changes and omissions are added.
+        ghosts: Whether bodies that collide with nothing keep their visual shapes.
+    """
+
+    def __init__(
+        self,
+        mujoco: Any,
+        model: Any,
+        data: Any,
+        file: Path,
+        notes: list[str],
+        *,
+        ghosts: bool = True,
+    ) -> None:
+        self._ghosts = ghosts
+        self._paired = {int(geom) for geom in (*model.pair_geom1, *model.pair_geom2)}
         self._mujoco = mujoco
         self._model = model
         self._data = data
@@ -226,10 +294,13 @@ class _Reader:
             if part is None:
                 continue
             collides = bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
+            collides = collides or geom in self._paired
             if collides:
                 collision.append(part)
             if int(model.geom_group[geom]) < _HIDDEN or not collides:
                 visual.append(part)
+        if not collision and not self._ghosts:
+            return (), ()
         return tuple(visual or collision), tuple(collision)
 
     def _read_shape(self, body: int, geom: int) -> Part | None:
@@ -383,6 +454,15 @@ class _Reader:
             name += "_"
         self._taken.add(name)
         return name
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """Link of each body."""
+        return tuple(self._bodies)
+
+    def find_joint_name(self, joint: int) -> str:
+        """Return the name of a joint, or its number."""
+        return self._find_name("joint", joint)
 
     def _find_name(self, kind: str, number: int) -> str:
         """Return the name of an element, or its kind and number."""

@@ -19,12 +19,7 @@ from vkc_pin.importing.formats.reading import FORMATS
 from vkc_pin.importing.homes.allowed_contacts import read_home_contacts
 from vkc_pin.importing.homes.mesh_rooms import MESH_SUFFIXES, read_mesh_room
 from vkc_pin.importing.homes.splitting import FLOOR_RISE, Home, add_floor, split_home
-from vkc_pin.importing.homes.writing import (
-    ImportedHomeObject,
-    measure_parts,
-    write_object,
-    write_obstacles,
-)
+from vkc_pin.importing.homes.writing import ImportedHomeObject, write_parts
 from vkc_pin.importing.objects.clean_up import (
     compute_bounds,
     load_surfaces,
@@ -32,8 +27,6 @@ from vkc_pin.importing.objects.clean_up import (
     rename_for_scenes,
 )
 from vkc_pin.importing.objects.object_reading import WEIGHTLESS, read_object
-from vkc_pin.importing.objects.pieces import PieceCache
-from vkc_pin.importing.progress import ImportProgress
 from vkc_pin.importing.scenes import (
     HORIZONTAL,
     locate_robot,
@@ -50,7 +43,6 @@ from vkc_pin.world.files.resources import check_path, choose_file_names
 from vkc_pin.world.files.writing import write_folder_atomically
 from vkc_pin.world.models.robot import Robot
 from vkc_pin.world.models.robot_file import load_robot
-from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
 
 _COMMAND = "import-home"
@@ -169,21 +161,9 @@ def import_home(  # noqa: PLR0913 - keyword options of a public call
     home = split_home(description)
     # `check_target` allowed replacing it
     with write_folder_atomically(target, force=True, source=path) as staging:
-        cache: PieceCache = {}
-        names = [item.name for item in home.objects]
-        stems = choose_file_names(names)
-        clearances = {"dist_safe": options.dist_safe, "grasp_clearance": options.grasp_clearance}
-        progress = ImportProgress(measure_parts(home))
-        objects = list[ImportedHomeObject]()
-        for item, stem in zip(progress.follow(home.objects), stems, strict=True):
-            objects.append(
-                write_object(item, loaded_robot, staging, cache, stem=stem, most=most, **clearances)
-            )
-        taken = {FLOOR, *names}
-        obstacles, obstacle_links, obstacle_notes = write_obstacles(
-            home, path, staging, taken, cache, progress
-        )
-        allowed, contact_notes = contacts.find_scene_pairs(home, obstacle_links)
+        parts = write_parts(home, path, loaded_robot, staging, options=options, most=most)
+        objects = parts.objects
+        allowed, contact_notes = contacts.find_scene_pairs(home, parts.obstacle_links)
         floor_low, floor_high = add_floor(home, low, high)
         x, y = (floor_low + floor_high)[:2] / 2.0
         x_range = round_interval(floor_low[0], floor_high[0])
@@ -194,7 +174,7 @@ def import_home(  # noqa: PLR0913 - keyword options of a public call
             "start": {"base": [round(float(x), 3), round(float(y), 3), 0.0]},
             "arena": {"x": x_range, "y": y_range},
             "start_region": {"x": list(x_range), "y": list(y_range)},
-            "obstacles": obstacles,
+            "obstacles": parts.obstacles,
             "objects": [item.entry for item in objects],
         }
         if allowed:
@@ -214,14 +194,14 @@ def import_home(  # noqa: PLR0913 - keyword options of a public call
         *_note_high_objects(scene, rng),
         *contacts.notes,
         *contact_notes,
-        *obstacle_notes,
+        *parts.notes,
     ]
     for written in objects:
         notes += [f"{written.name}: {note}" for note in written.notes]
     return ImportedHome(
         target / "scene.yaml",
         load_scene(target / "scene.yaml"),
-        tuple(objects),
+        objects,
         _count_shapes(home),
         reached,
         tuple(notes),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,9 +28,11 @@ from vkc_pin.importing.progress import ImportProgress
 from vkc_pin.importing.proposals.proposal import Proposals
 from vkc_pin.importing.proposals.propose import propose_attachments
 from vkc_pin.importing.targets import round_values
+from vkc_pin.options import Options
 from vkc_pin.world.files.resources import choose_file_names
 from vkc_pin.world.models.object_file import load_object
 from vkc_pin.world.models.robot import Robot
+from vkc_pin.world.scene.obstacles import FLOOR
 
 _LIFT = 0.2  # [m] by which a free object is lifted to test whether a hand can hold it
 # [m], and without unit: tolerance within which a visual and a collision shape coincide
@@ -67,6 +69,49 @@ class ImportedHomeObject:
                 by = f"by no hand: {self.proposals.because.get(joint, 'no grasp fits')}"
             parts.append(f"carried {by}" if self.free else f"{joint} {by}")
         return f"{self.name}: {'; '.join(parts)}"
+
+
+@dataclass(frozen=True, eq=False)
+class HomeParts:
+    """The written parts of a home.
+
+    Attributes:
+        objects: Movable objects, in the home's order.
+        obstacles: The scene's obstacle entries.
+        obstacle_links: Link in the file of each obstacle, by the name of the obstacle.
+        notes: Changes to obstacles.
+    """
+
+    objects: tuple[ImportedHomeObject, ...]
+    obstacles: list[dict[str, Any]]
+    obstacle_links: Mapping[str, str]
+    notes: tuple[str, ...]
+
+
+def write_parts(
+    home: Home, source: Path, robot: Robot, folder: Path, *, options: Options, most: int
+) -> HomeParts:
+    """Write the objects and obstacles of a home into the folder of a scene.
+
+    Args:
+        home: The divided home.
+        source: Its file, for messages.
+        robot: Robot for whose hand attachments are proposed.
+        folder: Folder of the scene.
+        options: Options with the clearances of attachments.
+        most: Largest number of attachments of one joint.
+    """
+    cache: PieceCache = {}
+    names = [item.name for item in home.objects]
+    stems = choose_file_names(names)
+    clearances = {"dist_safe": options.dist_safe, "grasp_clearance": options.grasp_clearance}
+    progress = ImportProgress(measure_parts(home))
+    objects = list[ImportedHomeObject]()
+    for item, stem in zip(progress.follow(home.objects), stems, strict=True):
+        objects.append(write_object(item, robot, folder, cache, stem=stem, most=most, **clearances))
+    taken = {FLOOR, *names}
+    obstacles, links, notes = write_obstacles(home, source, folder, taken, cache, progress)
+    return HomeParts(tuple(objects), obstacles, links, tuple(notes))
 
 
 def measure_parts(home: Home) -> list[float]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import re
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
@@ -13,6 +12,7 @@ import pinocchio as pin
 from vkc_pin.errors import InputError
 from vkc_pin.importing.description import MOVING_KINDS, Description, Joint, Link, Part
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.words import clean_name
 
 if TYPE_CHECKING:
     import trimesh
@@ -55,9 +55,7 @@ def choose_name(wanted: str, taken: set[str]) -> str:
 
     Unprintable characters, ".", "/" and spaces become "_"; equal results are numbered.
     """
-    plain = re.sub(r"[\s./]+", "_", wanted)
-    printable = "".join(letter if letter.isprintable() else "_" for letter in plain)
-    stem = printable.strip("_") or "part"
+    stem = clean_name(wanted)
     name = stem
     number = 1
     while name in taken:

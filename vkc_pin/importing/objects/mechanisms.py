@@ -9,19 +9,25 @@ from dataclasses import replace
 from vkc_pin.importing.description import Coupling, Description, Joint, Limits, Loop
 
 
-def dissolve_mechanisms(description: Description) -> Description:
+def dissolve_mechanisms(
+    description: Description, positions: Mapping[str, float] | None = None
+) -> Description:
     """Return an object whose joints are independent, with a note about each change.
 
     - A free link that is connected or welded to another link is fixed to it.
-    - Other links that are connected or welded close a loop, whose joints are held where they are
-      in the file.
+    - Other links that are connected or welded close a loop, whose joints are held.
     - A joint at a constant position is held there, and so is one that follows a held joint.
     - A joint that follows a moving one becomes independent, with the limits that its leader
       reaches.
+
+    Args:
+        description: The object.
+        positions: Positions of joints by name at which links are fixed and loops held, [rad] or
+            [m]. Default: those of the file, zero.
     """
     held = dict[str, float]()
     for loop in description.loops:
-        description = _hold_loop(description, loop, held)
+        description = _hold_loop(description, loop, held, positions or {})
     description, moving = _hold_followers(description, held)
     description = _limit_followers(description, moving)
     joints = dict(description.joints)
@@ -31,7 +37,12 @@ def dissolve_mechanisms(description: Description) -> Description:
     return replace(description, joints=joints, loops=(), couplings=())
 
 
-def _hold_loop(description: Description, loop: Loop, held: dict[str, float]) -> Description:
+def _hold_loop(
+    description: Description,
+    loop: Loop,
+    held: dict[str, float],
+    positions: Mapping[str, float],
+) -> Description:
     """Attach a free link that a loop connects, or hold the joints of the loop.
 
     Joints between an attached free link and the connection are held, too.
@@ -40,6 +51,7 @@ def _hold_loop(description: Description, loop: Loop, held: dict[str, float]) -> 
         description: The object.
         loop: The loop.
         held: Positions of held joints by name, [rad] or [m], which are completed.
+        positions: Positions of joints by name, [rad] or [m]; others are at zero.
     """
     first, second = loop.links
     first_path = list(description.walk_up(first))
@@ -51,14 +63,14 @@ def _hold_loop(description: Description, loop: Loop, held: dict[str, float]) -> 
     for side, other in ((first_side, second), (second_side, first)):
         free = [link for link in side if description.joints[link].kind == "floating"]
         if free:
-            description = _attach(description, free[0], other)
+            description = _attach(description, free[0], other, positions)
             fixed.append(f"free body '{free[0]}'")
             around = side
             break
     for link in around:
         joint = description.joints[link]
         if joint.kind != "fixed":
-            held.setdefault(joint.name, 0.0)
+            held.setdefault(joint.name, positions.get(joint.name, 0.0))
             fixed.append(f"joint '{joint.name}'")
     if not fixed:
         return description
@@ -66,9 +78,11 @@ def _hold_loop(description: Description, loop: Loop, held: dict[str, float]) -> 
     return description.add_notes(f"{names}, hence fixed: {', '.join(fixed)}")
 
 
-def _attach(description: Description, link: str, other: str) -> Description:
-    """Return the object with a free link fixed to another link, where both are in the file."""
-    placements = description.compute_placements()
+def _attach(
+    description: Description, link: str, other: str, positions: Mapping[str, float]
+) -> Description:
+    """Return the object with a free link fixed to another link, where both are at `positions`."""
+    placements = description.compute_placements(positions)
     fixed = replace(
         description.joints[link],
         name=f"{link}_fixed",

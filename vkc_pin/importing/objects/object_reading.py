@@ -34,8 +34,24 @@ def read_object(
         arguments: Arguments of a xacro file.
     """
     description = read_description(file, packages=packages, arguments=arguments)
+    return simplify_object(description, free=free)
+
+
+def simplify_object(
+    description: Description,
+    *,
+    free: bool = False,
+    positions: Mapping[str, float] | None = None,
+) -> Description:
+    """Return an object or a home as a tree of links with independent joints, noting changes.
+
+    Args:
+        description: The object as it was read.
+        free: Whether to keep free bodies; see `read_object`.
+        positions: Positions of joints that become fixed, by name, [rad] or [m]; others are at zero.
+    """
     description = description.add_notes(*description.warnings)
-    description = dissolve_mechanisms(description)
+    description = dissolve_mechanisms(description, positions)
     if not free:
         description = _remove_free_bodies(description)
     description = _fix_other_joints(description)

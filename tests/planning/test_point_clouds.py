@@ -9,6 +9,7 @@ import pytest
 from helpers.clouds import replace_obstacles
 
 import vkc_pin as vkc
+from vkc_pin.validation.remaining import RemainingCheck
 
 TASKS = {
     "drawer": vkc.Actuate("drawer", {"slide": 0.3}),
@@ -41,6 +42,10 @@ def test_base_drives_around_a_wall_of_points(tmp_path: Path) -> None:
     report = vkc.validate(blocked, free.steps, free.trajectory)
     assert not report.ok
     assert any("points" in violation.subject for violation in report.violations)
+    # Points of a later measurement block the rest of a motion that was free before.
+    check = RemainingCheck(scene, free.steps, free.trajectory, free.options)
+    assert not check.find_violations(scene)
+    assert check.find_violations(blocked)
     around = vkc.plan(blocked, [vkc.GoTo(2.5, 0.0, 0.0)], seed=0)
     assert around.success, str(around.report)
     assert np.abs(around.trajectory.positions[:, 1]).max() > 0.8

@@ -36,6 +36,14 @@ class PointCloud(coal.Box):
         self.points.flags.writeable = False
         self.radius = radius
 
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, PointCloud):
+            return False
+        return self.radius == other.radius and np.array_equal(self.points, other.points)
+
+    def __hash__(self) -> int:
+        return hash((len(self.points), self.radius))
+
     def __reduce__(self) -> tuple[Any, ...]:
         return PointCloud, (self.points, self.radius)
 
@@ -60,3 +68,9 @@ def divide_points(points: Floats, radius: float) -> list[tuple[PointCloud, Float
         center = (own.min(axis=0) + own.max(axis=0)) / 2
         divided.append((PointCloud(own - center, radius), center))
     return divided
+
+
+def select_for_drawing(points: Floats, count: int) -> Floats:
+    """Return every k-th of points, shape (n, 3), so that at most `count` are left."""
+    step = -(-len(points) // count)
+    return points[:: max(step, 1)]

@@ -49,6 +49,8 @@ def test_base_drives_around_a_wall_of_points(tmp_path: Path) -> None:
     around = vkc.plan(blocked, [vkc.GoTo(2.5, 0.0, 0.0)], seed=0)
     assert around.success, str(around.report)
     assert np.abs(around.trajectory.positions[:, 1]).max() > 0.8
+    with pytest.raises(vkc.InputError, match="measured points cannot be simulated"):
+        around.simulate()
     file = tmp_path / "plan.json"
     around.save(file)
     restored = vkc.Plan.load(file)

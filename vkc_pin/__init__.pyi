@@ -27,6 +27,7 @@ from .simulation.result import SimulationResult
 from .validation.report import Report, Violation
 from .validation.tolerances import Tolerances
 from .validation.validate import validate
+from .world.files.points import PointFile, read_points
 from .world.models.articulated_object import ArticulatedObject, Attachment, Freedom, Latch
 from .world.models.camera import Camera
 from .world.models.object_file import load_object
@@ -34,6 +35,7 @@ from .world.models.robot import Robot
 from .world.models.robot_file import load_robot
 from .world.scene.hold import Hold
 from .world.scene.joint_estimation import JointEstimate, estimate_joint
+from .world.scene.measured_points import PointCounts
 from .world.scene.placed_object import PlacedObject
 from .world.scene.scene import Scene, load_scene
 from .world.task.steps import Actuate, Configure, GoTo, Grasp, Place, Reach, Release, Touch
@@ -69,6 +71,8 @@ __all__ = [
     "PlacedObject",
     "Plan",
     "Planner",
+    "PointCounts",
+    "PointFile",
     "PreparedTask",
     "Reach",
     "ReachableAttachment",
@@ -106,6 +110,7 @@ __all__ = [
     "prefer_in_view",
     "prepare",
     "procedural",
+    "read_points",
     "replan",
     "scene_from_mujoco",
     "simulation",

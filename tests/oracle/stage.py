@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -16,11 +17,12 @@ from .plan import Hold, Phase, SavedPlan
 from .poses import IDENTITY, Poses, make_pose, read_orientation
 from .scene_objects import Grasp, SceneObject, Tree, load_object, load_robot
 from .supports import compute_distance, find_supports
-from .urdf import Shape, load_mesh_hull, make_solid, read_urdf
+from .urdf import Points, Shape, load_mesh_hull, make_solid, read_urdf
 
 __all__ = ["FLOOR", "Solid", "Stage", "World"]
 
 LENGTH, ANGLE = 2e-3, 5e-3  # [m], [rad]: largest change from sample to sample
+BLOCK = 0.5  # [m], edge of a cube of measured points
 FLOOR = "floor"
 _PARTS = 16  # of a step between waypoints, to bound its changes
 
@@ -66,6 +68,15 @@ class Stage:
     moving: set[tuple[str, str]]
     supports: dict[str, tuple[str, str]]
     verticals: dict[str, np.ndarray]
+
+
+def _divide_points(item: dict[str, Any]) -> list[Points]:
+    """Return measured points in cubes, each of which is a shape of its own."""
+    numbers = np.frombuffer(base64.b64decode(item["data"]), "<f4").astype(float).reshape(-1, 3)
+    blocks: dict[tuple[float, ...], list[np.ndarray]] = {}
+    for point in numbers:
+        blocks.setdefault(tuple(np.floor(point / BLOCK)), []).append(point)
+    return [Points(np.array(block), float(item["radius"])) for block in blocks.values()]
 
 
 class World:
@@ -143,6 +154,11 @@ class World:
             return [
                 Solid(name, "", shape, placement @ links[shape.link] @ shape.placement)
                 for shape in urdf.shapes
+            ]
+        if item["type"] == "points":
+            return [
+                Solid(name, "", Shape.make("", block, IDENTITY), placement)
+                for block in _divide_points(item)
             ]
         if item["type"] == "mesh":
             scale = np.broadcast_to(np.array(item.get("scale", 1.0), float), (3,))

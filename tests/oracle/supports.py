@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import coal
+import numpy as np
 
 from .poses import Poses, make_pose
+from .urdf import Points
 
 if TYPE_CHECKING:
     from .stage import World
@@ -24,8 +26,33 @@ def compute_distance(one: object, here: Poses, other: object, there: Poses, k: i
     i, j = (0 if len(place.rotation) == 1 else k for place in (here, there))
     a = coal.Transform3s(here.rotation[i], here.translation[i])
     b = coal.Transform3s(there.rotation[j], there.translation[j])
+    if isinstance(other, Points):
+        return _compute_distance_to_points(one, a, other, b)
+    if isinstance(one, Points):
+        return _compute_distance_to_points(other, b, one, a)
     _RESULT.clear()
     return float(coal.distance(one, a, other, b, _REQUEST, _RESULT))
+
+
+def _compute_distance_to_points(
+    one: Any, here: coal.Transform3s, other: Points, there: coal.Transform3s
+) -> float:
+    """Return the smallest distance to the ball of a point; those beyond its box are left out."""
+    one.computeLocalAABB()
+    low, high = one.aabb_local.min_, one.aabb_local.max_
+    world = other.points @ there.getRotation().T + there.getTranslation()
+    points = (world - here.getTranslation()) @ here.getRotation()
+    excess = np.maximum(np.maximum(low - points, points - high), 0.0)
+    bounds = np.linalg.norm(excess, axis=1) - other.radius
+    ball, smallest = coal.Sphere(other.radius), np.inf
+    for k in np.argsort(bounds):
+        if bounds[k] >= smallest:
+            break
+        _RESULT.clear()
+        where = coal.Transform3s(np.eye(3), points[k])
+        distance = coal.distance(one, coal.Transform3s(), ball, where, _REQUEST, _RESULT)
+        smallest = min(smallest, distance)
+    return float(smallest)
 
 
 def rests_on(

@@ -16,7 +16,15 @@ from helpers.assimp import read_triangles
 from .plan import NotJudged
 from .poses import Poses, make_pose, rotate_rpy
 
-__all__ = ["Shape", "Urdf", "load_mesh_hull", "make_solid", "read_urdf"]
+__all__ = ["Points", "Shape", "Urdf", "load_mesh_hull", "make_solid", "read_urdf"]
+
+
+@dataclass(frozen=True)
+class Points:
+    """Measured points, shape (n, 3) [m], each a ball of a radius [m]."""
+
+    points: np.ndarray
+    radius: float
 
 
 @dataclass(frozen=True)
@@ -48,6 +56,10 @@ class Shape:
                 half,
                 float(np.linalg.norm(corners - centre, axis=1).max()),
             )
+        if isinstance(solid, Points):
+            low, high = solid.points.min(axis=0), solid.points.max(axis=0)
+            centre, half = (low + high) / 2, (high - low) / 2 + solid.radius
+            return cls(link, solid, placement, centre, half, float(np.linalg.norm(half)))
         if isinstance(solid, coal.Box):
             half = np.array(solid.halfSide)
             radius = float(np.linalg.norm(half))

@@ -21,6 +21,7 @@ from vkc_pin.simulation.contacts import Pairs
 from vkc_pin.simulation.physics import Physics, import_mujoco
 from vkc_pin.simulation.servos import Servo
 from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.world.collision.point_cloud import PointCloud
 from vkc_pin.world.models.coordinates import MovedJoint
 from vkc_pin.world.models.dynamics import Resistance
 from vkc_pin.world.models.shapes import triangulate
@@ -323,6 +324,12 @@ class Builder:
         """Add a shape to a body; a `thin` mesh may have no volume."""
         kinds = self.mj.mjtGeom
         where = {"name": name, "pos": place.translation, "quat": to_mujoco_quaternion(place)}
+        if isinstance(shape, PointCloud):
+            raise InputError(
+                "measured points cannot be simulated",
+                field="scene.obstacles",
+                expected="shapes instead of points",
+            )
         if isinstance(shape, coal.Box):
             return body.add_geom(type=kinds.mjGEOM_BOX, size=shape.halfSide, **where)
         if isinstance(shape, coal.Sphere):

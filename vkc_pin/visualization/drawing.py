@@ -259,9 +259,13 @@ class Drawing:
         ]
 
     def _draw_room(self) -> None:
-        """Draw obstacles, floor and edges of walls."""
+        """Draw obstacles, measured points, floor and edges of walls."""
         for part in self.room.make_parts():
             self._draw_part(replace(part, name=f"room/{part.name}"))
+        for name, points, radius, colour in self.room.make_clouds():
+            colours = np.tile(np.array(colour, np.float32)[:, None], len(points))
+            cloud = g.PointCloud(points.astype(np.float32).T, colours, size=2.0 * radius)
+            self._draw_without_shadow(f"room/{name}", cloud)
         for name, points, grey in self.room.make_lines():
             thin = g.LineBasicMaterial(color=encode_colour((grey, grey, grey)))
             geometry = g.PointsGeometry(points.astype(np.float32).T)

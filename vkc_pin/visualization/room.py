@@ -12,6 +12,7 @@ import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.visualization.threejs import Solid, make_box, shade, to_solid
+from vkc_pin.world.collision.point_cloud import PointCloud, select_for_drawing
 from vkc_pin.world.files.meshes import load_parts
 from vkc_pin.world.models.shapes import compute_world_box
 from vkc_pin.world.scene.scene import Scene
@@ -30,6 +31,8 @@ _GRID_STEP = 0.5
 _GRID_HEIGHT = 0.002
 # [m] of meshes
 _DETAIL = 1e-3
+_MAX_DRAWN_POINTS = 100_000  # 2.4 MB in a page
+_CLOUD_OPACITY = 0.3  # of a block of measured points, between which one sees
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,8 +68,12 @@ class Room:
         self.reach = float(np.hypot(x_max - x_min, y_max - y_min)) / 2.0
         self._walls: list[pin.GeometryObject] = []
         self._furniture: list[pin.GeometryObject] = []
-        for shape in scene.obstacle_visual:
-            if is_wall(shape):
+        self._clouds: dict[str, list[pin.GeometryObject]] = {}
+        labels = scene.obstacle_visual_labels
+        for shape, label in zip(scene.obstacle_visual, labels, strict=True):
+            if isinstance(shape.geometry, PointCloud):
+                self._clouds.setdefault(label, []).append(shape)
+            elif is_wall(shape):
                 self._walls.append(shape)
             else:
                 self._furniture.append(shape)
@@ -88,6 +95,22 @@ class Room:
         for shape in self._walls:
             parts += self._make_wall_parts(shape)
         return parts
+
+    def make_clouds(self) -> list[tuple[str, Floats, float, tuple[float, ...]]]:
+        """Return name, points, shape (n, 3) [m], radius [m] and colour of measured points.
+
+        Of more than 100 000 points, every k-th is drawn.
+        """
+        clouds = []
+        for label, shapes in self._clouds.items():
+            placed = []
+            for shape in shapes:
+                rotation = shape.placement.rotation
+                placed.append(shape.geometry.points @ rotation.T + shape.placement.translation)
+            points = select_for_drawing(np.concatenate(placed), _MAX_DRAWN_POINTS)
+            colour = tuple(float(value) for value in shapes[0].meshColor[:3])
+            clouds.append((label, points, float(shapes[0].geometry.radius), colour))
+        return clouds
 
     def make_lines(self) -> list[tuple[str, Floats, float]]:
         """Return name, segments, shape (2·k, 3) [m], and brightness of grid and wall edges."""
@@ -121,6 +144,10 @@ class Room:
         for shape in self._furniture:
             lower, upper = compute_world_box(shape.geometry, shape.placement)
             boxes.append((lower, upper, 1.0))
+        for shapes in self._clouds.values():
+            for shape in shapes:
+                lower, upper = compute_world_box(shape.geometry, shape.placement)
+                boxes.append((lower, upper, _CLOUD_OPACITY))
         return boxes
 
     def _find_inside(self, shape: pin.GeometryObject) -> tuple[int, float]:

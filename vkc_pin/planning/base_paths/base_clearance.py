@@ -17,6 +17,7 @@ import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.collision.distances import compute_distance
+from vkc_pin.world.collision.point_cloud import PointCloud
 from vkc_pin.world.collision.solids import convert_solid, flatten_placements
 
 Shape = tuple[coal.CollisionGeometry, pin.SE3]
@@ -295,7 +296,9 @@ def compute_hull_points(
     rim = np.column_stack([np.cos(_RIM_ANGLES), np.sin(_RIM_ANGLES), 0.0 * _RIM_ANGLES])
     rim = rim / (np.cos(_RIM_ANGLES[1] / 2) if outer else 1.0)
     radius = shape.getSweptSphereRadius() if outer else 0.0
-    if isinstance(shape, coal.Cylinder | coal.Cone):
+    if isinstance(shape, PointCloud) and not outer:
+        points = np.empty((0, 3))  # no convex part is worth the search
+    elif isinstance(shape, coal.Cylinder | coal.Cone):
         top = np.array([0.0, 0.0, shape.halfLength])
         upper = shape.radius * rim + top if isinstance(shape, coal.Cylinder) else top[None]
         points = np.concatenate([shape.radius * rim - top, upper])

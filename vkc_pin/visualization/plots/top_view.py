@@ -8,6 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.collision.point_cloud import PointCloud, select_for_drawing
 from vkc_pin.world.models.shapes import triangulate
 from vkc_pin.world.scene.obstacles import FLOOR
 from vkc_pin.world.trajectory.placements import sample_motion
@@ -29,6 +30,8 @@ _ROBOT_HEIGHT = 1.8
 _ARROW = 0.45
 # times at which paths are drawn
 _SAMPLES = 400
+# points of measured obstacles that are drawn
+_MAX_DRAWN_POINTS = 50_000
 # colours of footprints at both ends, and of paths
 _START = "#3a6bc4"
 _END = "#1a9961"
@@ -50,8 +53,14 @@ def draw_top_view(
     from matplotlib.patches import Polygon
 
     axes = figure.subplots()
+    clouds: list[Floats] = []
     for i, shape in enumerate(world.shapes):
         if shape.parentJoint or world.collision_labels[i] == FLOOR:
+            continue
+        if isinstance(shape.geometry, PointCloud):
+            clouds.append(
+                shape.placement.translation + shape.geometry.points @ shape.placement.rotation.T
+            )
             continue
         points = _place_vertices(world, i, np.eye(4), {})
         style: dict[str, Any] = {"edgecolor": "0.45", "linewidth": 0.7, "zorder": 1}
@@ -62,6 +71,9 @@ def draw_top_view(
             style["facecolor"] = (*np.clip(shape.meshColor[:3], 0.0, 1.0), 0.75)
         axes.add_patch(Polygon(compute_outline(points), **style))
 
+    if clouds:
+        drawn = select_for_drawing(np.concatenate(clouds), _MAX_DRAWN_POINTS)
+        axes.plot(*drawn[:, :2].T, ",", color="0.45", zorder=1, rasterized=True)
     _draw_motion(axes, world, trajectory)
     x_min, x_max, y_min, y_max = world.scene.arena
     axes.set_xlim(x_min - 0.1, x_max + 0.1)

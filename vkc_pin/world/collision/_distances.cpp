@@ -17,6 +17,7 @@
 #include "boxes.hpp"
 #include "clearances.hpp"
 #include "margins.hpp"
+#include "points.hpp"
 #include "shapes.hpp"
 #include "solids.hpp"
 #include "world_boxes.hpp"
@@ -31,12 +32,14 @@ NB_MODULE(_distances, module)
   module.def("primitive", &primitive);
   module.def("convex", &convex);
   module.def("mesh", &mesh);
+  module.def("points", &points);
   nb::class_<Shapes>(module, "Shapes")
     .def(nb::init<const std::vector<Solid> &, const Numbers<2> &, double>())
     .def("placed", &Shapes::move_fixed)
     .def("distances", &Shapes::compute_distances)
     .def("shortest", &Shapes::find_closest_pairs);
   module.def("distance", &distance);
+  module.def("near", &find_near_points);
   module.def("asked", [] { return query_count.load(); });
   nb::class_<Boxes>(module, "Boxes")
     .def(

@@ -86,8 +86,9 @@ public:
     {
       if (candidate.bound > rounding_ - allowed)
         return false; // since candidates are sorted by their bounds
-      const double distance = distance_query_.compute_distance(candidate.first, candidate.second);
-      if (distance < reach_ && candidate.margin - distance > allowed)
+      const double bound = std::min(reach_, candidate.margin - allowed);
+      const double distance = distance_query_.compute_distance(candidate.first, candidate.second, bound);
+      if (distance < bound && candidate.margin - distance > allowed)
         return true;
     }
     return false;

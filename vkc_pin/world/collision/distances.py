@@ -13,7 +13,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.utils.arrays import Floats, Ints
+from vkc_pin.utils.arrays import Bools, Floats, Ints
 from vkc_pin.world.collision.batched_model import BatchedModel
 from vkc_pin.world.collision.boxes import Boxes
 from vkc_pin.world.collision.solids import (
@@ -171,6 +171,19 @@ def compute_distance(
     """
     row = load_compiled().distance(first, first_placement, second, second_placement, TOLERANCE)
     return float(row[0]), row[1:4]
+
+
+def find_near_points(solid: Any, placement: Floats, points: Floats, reach: float) -> Bools:
+    """Return whether each point is closer to a solid than `reach`, shape (n,).
+
+    Args:
+        solid: Result of `solids.convert_solid`.
+        placement: Row of `solids.flatten_placements`, shape (12,).
+        points: Points in the world frame, shape (n, 3) [m].
+        reach: Distance [m].
+    """
+    near = load_compiled().near(solid, placement, points, reach, TOLERANCE)
+    return np.asarray(near).astype(bool)
 
 
 def count_distance_queries() -> int:

@@ -112,7 +112,7 @@ inline void leave_cylinder(
     set_result(result, distance, outwards, sphere.centre + surface * outwards);
 }
 
-inline double signed_distance(
+inline double signed_distance_of_solids(
   const coal::CollisionGeometry & one,
   const Transform3s & where,
   const coal::CollisionGeometry & other,

@@ -7,6 +7,7 @@
 
 #include <algorithm>
 #include <atomic>
+#include <limits>
 #include <memory>
 #include <stdexcept>
 #include <tuple>
@@ -17,7 +18,7 @@
 
 #include "arrays.hpp"
 #include "bodies.hpp"
-#include "overlaps.hpp"
+#include "points.hpp"
 #include "solids.hpp"
 
 namespace {
@@ -81,12 +82,13 @@ public:
     // Must be called when the numbers behind the current placements have changed.
     void invalidate() { ++state_; }
 
-    double compute_distance(Index first, Index second)
+    // Distances to points of at least `bound` may be returned as `bound`.
+    double compute_distance(Index first, Index second, double bound = std::numeric_limits<double>::infinity())
     {
       ++count_;
       result_.clear();
       const auto &one = get_transform(std::size_t(first)), &other = get_transform(std::size_t(second));
-      return signed_distance(*shapes_.shapes_[first], one, *shapes_.shapes_[second], other, request_, result_);
+      return signed_distance(*shapes_.shapes_[first], one, *shapes_.shapes_[second], other, bound, request_, result_);
     }
 
     // Of candidates sorted by their bounds, selects at most `max_pairs` closer than `reach` with least
@@ -107,9 +109,13 @@ public:
         // Then neither this candidate nor any later one can be among them.
         if (is_full && (max_pairs == 0 || candidate.bound > near[max_pairs - 1].shortfall + rounding))
           break;
+        // Larger distances cannot enter the list.
+        double bound = reach;
+        if (is_full)
+          bound = std::min(bound, near[max_pairs - 1].shortfall + candidate.margin + rounding);
         Found found;
-        found.distance = compute_distance(candidate.first, candidate.second);
-        if (!(found.distance < reach))
+        found.distance = compute_distance(candidate.first, candidate.second, bound);
+        if (!(found.distance < bound))
           continue;
         found.shortfall = found.distance - candidate.margin;
         found.margin = candidate.margin;
@@ -293,10 +299,30 @@ Array<double> distance(
   std::vector<double> found(COLUMNS);
   coal::DistanceResult result;
   found[0] = signed_distance(
-    *one.geometry, transform(where.data()), *other.geometry, transform(there.data()), make_request(tolerance), result);
+    *one.geometry, transform(where.data()), *other.geometry, transform(there.data()),
+    std::numeric_limits<double>::infinity(), make_request(tolerance), result);
   copy_witness(result, found.data() + 1);
   ++query_count;
   return handed_over(std::move(found), {COLUMNS});
+}
+
+// Whether each point, of shape (n, 3), is closer than `reach` to a shape.
+Array<std::uint8_t> find_near_points(
+  const Solid & solid, const Numbers<1> & where, const Numbers<2> & points, double reach, double tolerance)
+{
+  if (where.shape(0) != PLACEMENT || points.shape(1) != 3)
+    throw std::invalid_argument("a placement is of shape (12,), points are of shape (n, 3)");
+  const coal::Transform3s placement = transform(where.data());
+  const coal::DistanceRequest request = make_request(tolerance);
+  const std::size_t count = points.shape(0);
+  std::vector<std::uint8_t> near(count);
+  for (std::size_t i = 0; i < count; ++i)
+  {
+    const coal::Vec3s local = placement.inverseTransform(coal::Vec3s(points(i, 0), points(i, 1), points(i, 2)));
+    NearestPoint nearest(*solid.geometry, 0.0, reach, request);
+    near[i] = nearest.is_near({{local[0], local[1], local[2]}});
+  }
+  return handed_over(std::move(near), {count});
 }
 
 } // namespace

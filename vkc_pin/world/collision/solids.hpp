@@ -1,4 +1,4 @@
-// Creates coal shapes from their dimensions, or from points and faces.
+// Creates shapes from their dimensions, or from points and faces, with their local boxes.
 #pragma once
 
 #include <memory>
@@ -11,6 +11,7 @@
 #include <coal/shape/geometric_shapes.h>
 
 #include "arrays.hpp"
+#include "points.hpp"
 
 namespace {
 
@@ -59,6 +60,7 @@ Solid primitive(const std::string & kind, const std::vector<double> & numbers, d
   else
     throw std::invalid_argument("unknown kind of shape: " + kind);
   shape->setSweptSphereRadius(swept_sphere_radius);
+  shape->computeLocalAABB();
   return {shape};
 }
 
@@ -94,9 +96,9 @@ Solid convex(const Numbers<2> & points, const Indices<2> & faces, double swept_s
 {
   auto corners = std::make_shared<std::vector<coal::Vec3s>>(to_corners(points));
   auto triangles = std::make_shared<std::vector<coal::Triangle>>(to_triangles(faces, corners->size()));
-  auto shape = std::make_shared<coal::Convex<coal::Triangle>>(
-    corners, unsigned(corners->size()), triangles, unsigned(triangles->size()));
+  auto shape = std::make_shared<Hull>(corners, triangles);
   shape->setSweptSphereRadius(swept_sphere_radius);
+  shape->computeLocalAABB();
   return {shape};
 }
 
@@ -108,7 +110,13 @@ Solid mesh(const Numbers<2> & points, const Indices<2> & faces)
   model->beginModel(unsigned(triangles.size()), unsigned(corners.size()));
   model->addSubModel(corners, triangles);
   model->endModel();
+  model->computeLocalAABB();
   return {model};
+}
+
+Solid points(const Numbers<2> & centers, double radius)
+{
+  return {std::make_shared<Points>(centers, radius)};
 }
 
 } // namespace

@@ -16,6 +16,7 @@ from vkc_pin.errors import BuildError, InputError
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.optional_imports import REBUILD_HINT, import_compiled
 from vkc_pin.utils.system import count_cores
+from vkc_pin.world.collision.point_cloud import PointCloud
 from vkc_pin.world.files.meshes import get_triangles
 
 _MAX_THREADS = 8
@@ -71,8 +72,11 @@ def _check_version(package: str, version: str, installed: str) -> None:
 def convert_solid(shape: coal.CollisionGeometry) -> Any:
     """Return a coal shape as an object of the compiled module, with its swept sphere radius.
 
-    Convex shapes and meshes are cached as long as the shape lives and its points do not change.
+    Convex shapes, meshes and points are cached as long as the shape lives and its points do not
+    change.
     """
+    if isinstance(shape, PointCloud):
+        return _convert_with_cache(shape, shape.points, shape.radius)
     if isinstance(shape, coal.Convex):
         points = np.asarray(shape.points(), np.float64)
         return _convert_with_cache(shape, points, float(shape.getSweptSphereRadius()))
@@ -114,11 +118,12 @@ def _convert_with_cache(shape: Any, points: Floats, radius: float) -> Any:
         is_owner = cached.owner() is shape
         if is_owner and cached.points == content and cached.radius == radius:
             return cached.solid
-    faces = get_triangles(shape)
-    if isinstance(shape, coal.Convex):
-        solid = load_compiled().convex(points, faces, radius)
+    if isinstance(shape, PointCloud):
+        solid = load_compiled().points(points, radius)
+    elif isinstance(shape, coal.Convex):
+        solid = load_compiled().convex(points, get_triangles(shape), radius)
     else:
-        solid = load_compiled().mesh(points, faces)
+        solid = load_compiled().mesh(points, get_triangles(shape))
     owner = weakref.ref(shape, lambda _: _cache.pop(key, None))
     _cache[key] = _Cached(owner, content, radius, solid)
     return solid

@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.world.models.shapes import copy_shape
+from vkc_pin.world.scene.measured_points import make_cloud_shapes
 
 if TYPE_CHECKING:
     from vkc_pin.world.scene import scene_schema as schema
@@ -30,6 +31,8 @@ def make_obstacle_shapes(
 
     if isinstance(item, schema.UrdfSchema):
         return _make_urdf_shapes(item, pose, folder / item.file)
+    if isinstance(item, schema.PointsSchema):
+        return make_cloud_shapes(item, pose)
     mesh_path = ""
     mesh_scale = np.ones(3)
     solid: coal.CollisionGeometry
@@ -68,8 +71,8 @@ def move_obstacle_shape(
         after: New placement of the obstacle.
     """
     placement = after
-    if item.type == "urdf":
-        # Only the links of a URDF have placements of their own in the obstacle.
+    if item.type in ("urdf", "points"):
+        # Links of a URDF and blocks of points have placements of their own in the obstacle.
         placement = after * before.actInv(shape.placement)
     return copy_shape(shape, shape.name, placement)
 

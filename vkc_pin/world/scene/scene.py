@@ -53,12 +53,14 @@ from vkc_pin.world.scene.robot_velocity import make_robot_velocity
 
 if TYPE_CHECKING:
     from vkc_pin.world.models.robot import Base, Robot
+    from vkc_pin.world.scene.measured_points import PointCounts
     from vkc_pin.world.scene.scene_schema import RegionSchema, SceneSchema
 
 
 START_CLEARANCE = 0.03
 """Minimum distance of a random start from all shapes but the floor [m]."""
 _MAX_TRIES = 2000  # random starts
+_LARGEST_RADIUS = 1.0  # [m] of measured points
 _ROBOT_FILES = (".urdf", ".yaml", ".yml")
 
 
@@ -412,6 +414,88 @@ class Scene:
         if not (is_stated and is_within):
             return on_map
         return Scene.from_document({**document, "arena": arena}, self.folder)
+
+    def with_points(
+        self,
+        points: ArrayLike,
+        radius: float = 0.01,
+        frame: str | None = None,
+        *,
+        name: str = "points",
+    ) -> Scene:
+        """Return the scene with measured points as an obstacle, each a ball of a radius.
+
+        Points of the robot at its start and of what it holds (within 3 cm), and of the floor (below
+        5 cm), are removed; `point_counts` has their numbers. Points of articulated objects are not:
+        leave these out. Coordinates are kept in single precision.
+
+        Args:
+            points: Points, shape (n, 3) [m].
+            radius: Radius of each [m]: at least half of the distance between neighbours, so that
+                nothing fits between.
+            frame: Link or frame of the robot in which they were measured at the start of this
+                scene. Default: the world.
+            name: Name of the obstacle. Measured points of this name are replaced.
+
+        Raises:
+            UnknownNameError: The robot has no such frame.
+            InputError: `points` is no such array, has no or more than 2 000 000 points, or one that
+                is not finite; no point remains; the radius is not positive; another obstacle or
+                object has the name.
+        """
+        from vkc_pin.world.scene.measured_points import (
+            check_points,
+            find_frame_placement,
+            remove_known_points,
+        )
+        from vkc_pin.world.scene.scene_file import add_points, find_surroundings
+
+        measured = check_points(points)
+        is_valid_radius = is_number(radius) and 0.0 < radius <= _LARGEST_RADIUS
+        if not is_valid_radius:
+            raise InputError(
+                "invalid radius",
+                field="radius",
+                expected=f"a positive number up to {_LARGEST_RADIUS:g} m",
+                got=format_value(radius),
+            )
+        self._check_points_name(name)
+        if frame is not None:
+            pose = find_frame_placement(self.robot, self.start, frame)
+            measured = measured @ pose.rotation.T + pose.translation
+        around = find_surroundings(
+            robot=self.robot,
+            start=self.start,
+            opening=self.opening,
+            objects=self.objects,
+            holds=self.holds,
+            floor=self.floor,
+        )
+        kept, counts = remove_known_points(measured, float(radius), around)
+        # Results in `memory` depend on the obstacles: the copy begins with none.
+        changed = add_points(vars(self), name, kept, float(radius), counts)
+        return dataclasses.replace(self, **changed)
+
+    def _check_points_name(self, name: str) -> None:
+        """Check that measured points can have a name."""
+        others = [*self.objects, FLOOR, "robot"]
+        others += [one.name for one in self.described.obstacles if one.type != "points"]
+        is_valid = isinstance(name, str) and name.isidentifier()
+        if not is_valid or name in others:
+            raise InputError(
+                "this name cannot be used",
+                field="name",
+                expected="an identifier that no object and no other kind of obstacle has",
+                got=format_value(name),
+            )
+
+    @property
+    def point_counts(self) -> dict[str, PointCounts]:
+        """Obstacle of measured points → numbers of its points that were kept and removed."""
+        from vkc_pin.world.scene.measured_points import get_counts
+
+        clouds = [item for item in self.described.obstacles if item.type == "points"]
+        return {item.name: get_counts(item) for item in clouds}
 
     def with_held(
         self,

@@ -17,6 +17,7 @@ from vkc_pin.errors import UnknownNameError, find_nearest_name
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.pickling import freeze
 from vkc_pin.world.files.documents import Document, parse_document
+from vkc_pin.world.files.points import DEFAULT_RADIUS, encode_points, read_points
 from vkc_pin.world.files.resources import check_path
 from vkc_pin.world.files.srdf import format_names, read_allowed_pairs
 from vkc_pin.world.models.grafting import round_placement
@@ -36,6 +37,12 @@ from vkc_pin.world.scene.hold import (
     resolve_holds,
 )
 from vkc_pin.world.scene.map_obstacles import MAP, MapObstacle
+from vkc_pin.world.scene.measured_points import (
+    PointCounts,
+    Surroundings,
+    describe_removed,
+    remove_known_points,
+)
 from vkc_pin.world.scene.obstacles import (
     FLOOR,
     make_floor_shape,
@@ -55,6 +62,18 @@ def make_scene_fields(document: Document, folder: Path) -> dict[str, Any]:
     for index, placed_item in enumerate(description.objects):
         placed = _load_object(document, ("objects", index), placed_item, folder)
         objects[placed_item.name] = placed
+    start = _make_start(document, description.start, robot)
+    start_velocity = _make_start_velocity(document, description.start, robot, start)
+    holds = _make_holds(document, description.start.held, objects, robot, start)
+    around = find_surroundings(
+        robot=robot,
+        start=start,
+        opening=description.start.opening,
+        objects=objects,
+        holds=holds,
+        floor=description.floor,
+    )
+    description = _load_points(document, description, folder, around)
     map_obstacle = _load_map(document, description.map, folder)
     arena = _make_arena(description.arena, map_obstacle)
     obstacles = list[pin.GeometryObject]()
@@ -78,8 +97,6 @@ def make_scene_fields(document: Document, folder: Path) -> dict[str, Any]:
         obstacles.append(make_floor_shape(arena))
         labels.append(FLOOR)
     _check_within_arena(document, description, arena)
-    start = _make_start(document, description.start, robot)
-    start_velocity = _make_start_velocity(document, description.start, robot, start)
     return {
         "name": description.name or (document.file.stem if document.file else "scene"),
         "file": document.file,
@@ -96,11 +113,69 @@ def make_scene_fields(document: Document, folder: Path) -> dict[str, Any]:
         "floor": description.floor,
         "arena": arena,
         "start_region": description.start_region,
-        "holds": _make_holds(document, description.start.held, objects, robot, start),
+        "holds": holds,
         "allowed": freeze(_find_allowed_pairs(document, description, folder, robot, objects)),
         "described": description,
         "opening": description.start.opening,
     }
+
+
+def find_surroundings(
+    *,
+    robot: Robot,
+    start: Floats,
+    opening: float | None,
+    objects: Mapping[str, PlacedObject],
+    holds: Sequence[Hold],
+    floor: bool,
+) -> Surroundings:
+    """Return what measured points are compared with; the arguments are attributes of a scene."""
+    placed = place_held_objects(objects, lambda: compute_tool_placement(robot, start), holds)
+    held = tuple(placed[hold.object] for hold in holds)
+    return Surroundings(robot, start, opening, held, floor)
+
+
+def add_points(
+    fields: Mapping[str, Any], name: str, points: Floats, radius: float, counts: PointCounts
+) -> dict[str, Any]:
+    """Return the attributes of a scene that change when measured points are added, by name.
+
+    Args:
+        fields: Attributes of a `Scene`, by name.
+        name: Name of the obstacle; measured points of that name are replaced.
+        points: Points in the world frame, shape (n, 3) [m].
+        radius: Radius of each [m].
+        counts: What became of the points.
+    """
+    described = fields["described"]
+    item = schema.PointsSchema(
+        name=name,
+        type="points",
+        radius=radius,
+        data=encode_points(points),
+        removed=describe_removed(counts),
+    )
+    others = [one for one in described.obstacles if one.name != name]
+    changed = {"described": described.model_copy(update={"obstacles": (*others, item)})}
+    changed["obstacle_names"] = (*(one.name for one in others), name)
+    visual_shapes, shapes = make_obstacle_shapes(item, _make_pose(item), fields["folder"])
+    for key, added in (("obstacle", shapes), ("obstacle_visual", visual_shapes)):
+        shapes_key = "obstacles" if key == "obstacle" else key
+        labels_key = f"{key}_labels"
+        kept_shapes = []
+        kept_labels = []
+        floor_shapes = []
+        for shape, label in zip(fields[shapes_key], fields[labels_key], strict=True):
+            if label == FLOOR:
+                floor_shapes.append(shape)
+            elif label != name:
+                kept_shapes.append(shape)
+                kept_labels.append(label)
+        # The floor is last, as in a scene from a file.
+        changed[shapes_key] = (*kept_shapes, *added, *floor_shapes)
+        floor_labels = [FLOOR] * len(floor_shapes)
+        changed[labels_key] = (*kept_labels, *[name] * len(added), *floor_labels)
+    return changed
 
 
 def make_document(fields: Mapping[str, Any]) -> dict[str, Any]:
@@ -615,6 +690,36 @@ def _extract_part(document: Document, path: tuple[str | int, ...]) -> Document:
         if place[:depth] == path:
             lines[place[depth:]] = line
     return Document(data, document.file, lines)
+
+
+def _load_points(
+    document: Document, description: schema.SceneSchema, folder: Path, around: Surroundings
+) -> schema.SceneSchema:
+    """Return the description with the points of files in it, without those of the robot."""
+    obstacles = list(description.obstacles)
+    for index, item in enumerate(obstacles):
+        if not isinstance(item, schema.PointsSchema) or item.file is None:
+            continue
+        path = ("obstacles", index, "file")
+        file = _find_file(document, path, folder, item.file)
+        with document.annotate_errors(path):
+            loaded = read_points(file)
+            radius = item.radius
+            if radius is None:
+                radius = DEFAULT_RADIUS if loaded.radius is None else loaded.radius
+            pose = _make_pose(item)
+            world_points = loaded.points @ pose.rotation.T + pose.translation
+            kept, counts = remove_known_points(world_points, radius, around)
+        counts = counts._replace(not_finite=loaded.dropped)
+        in_frame = (kept - pose.translation) @ pose.rotation
+        update = {
+            "file": None,
+            "radius": radius,
+            "data": encode_points(in_frame),
+            "removed": describe_removed(counts),
+        }
+        obstacles[index] = item.model_copy(update=update)
+    return description.model_copy(update={"obstacles": tuple(obstacles)})
 
 
 def _load_obstacle(

@@ -22,6 +22,7 @@ from vkc_pin.world.files.fields import (
     require_length,
     wrap_text,
 )
+from vkc_pin.world.files.points import MAX_POINTS, decode_points
 from vkc_pin.world.models.robot import Base
 
 _MAX_OBSTACLES = 10_000  # they take some seconds to load
@@ -88,6 +89,7 @@ def _parse_measured(value: Any) -> Any:
     return value
 
 
+Count = Annotated[int, Field(ge=0)]
 Fraction = Annotated[Number, Field(ge=0.0, le=1.0)]
 Size = Annotated[tuple[Positive, Positive, Positive], require_length(3)]
 Colour = Annotated[
@@ -185,8 +187,53 @@ class UrdfSchema(PoseSchema):
     file: str
 
 
+def _check_encoded_points(value: str) -> bool:
+    try:
+        points = decode_points(value)
+    except ValueError:
+        return False
+    return bool(0 < len(points) <= MAX_POINTS and np.isfinite(points).all())
+
+
+class PointsSchema(ShapeSchema):
+    """Measured points of one radius, from a file or, as saved scenes have them, as `data`.
+
+    `position` and orientation are those of the frame of the points. Of the points of a file, those
+    of the robot at its start, of what it holds and of the floor are `removed`, with their numbers.
+    """
+
+    type: Literal["points"]
+    position: Vector3 = (0.0, 0.0, 0.0)
+    radius: Positive | None = None
+    file: str | None = None
+    data: (
+        Annotated[
+            str,
+            require(
+                _check_encoded_points, "no points", "base64 of n × 3 finite little-endian floats"
+            ),
+        ]
+        | None
+    ) = None
+    removed: Mapping[Literal["robot", "floor", "not_finite"], Count] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _check_file_or_data(self) -> PointsSchema:
+        if (self.file is None) == (self.data is None):
+            raise make_validation_error("neither a file nor data", "one of file and data")
+        if self.data is not None and self.radius is None:
+            raise make_validation_error("data without a radius", "radius, such as 0.01")
+        return self
+
+
 ObstacleSchema = Annotated[
-    BoxSchema | SphereSchema | CylinderSchema | CapsuleSchema | MeshSchema | UrdfSchema,
+    BoxSchema
+    | SphereSchema
+    | CylinderSchema
+    | CapsuleSchema
+    | MeshSchema
+    | UrdfSchema
+    | PointsSchema,
     Field(discriminator="type"),
 ]
 

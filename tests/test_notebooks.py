@@ -121,6 +121,13 @@ EXPECTED: dict[str, dict[str, tuple[str, ...]]] = {
         "loop": (r"^<ExecutionResult success", "replan .*door is elsewhere"),
         "person": (r"^<ExecutionResult success", r"(replan|brake) .*stool"),
     },
+    "13_from_a_cloud_to_a_drawer": {
+        "scene": ("success — reach drawer.handle, move drawer.slide",),
+        "cloud": (r"^1\d{5} points",),
+        "known": (r"'points': PointCounts\(kept=\d+", "the blind motion is free: False"),
+        "plan": ("success — reach drawer.handle, move drawer.slide", VALID),
+        "truth": ("^True",),
+    },
 }
 
 

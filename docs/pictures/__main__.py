@@ -20,6 +20,7 @@ NAMES = (
     "closed_loop",
     "gallery",
     "initial_guesses",
+    "measured_points",
     "ros_map",
     "scenes",
     "separation",

@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vkc_pin.errors import InputError
+from vkc_pin.world.collision.batched_model import BatchedModel
 from vkc_pin.world.collision.boxes import Boxes
 from vkc_pin.world.collision.distances import Clearances, Margins, Shapes, find_near_points
 from vkc_pin.world.collision.point_cloud import PointCloud, divide_points
-from vkc_pin.world.collision.batched_model import BatchedModel
 from vkc_pin.world.collision.solids import convert_solid, flatten_placements
 from vkc_pin.world.files.meshes import make_bvh, make_convex_hull
 from vkc_pin.world.models.shapes import compute_shape_distance, compute_world_box

@@ -55,7 +55,7 @@ def make() -> None:
 
 
 def draw_rooms() -> tuple[Bools, Bools]:
-    """Return the walls of two rooms with jagged sides, and what is outside of them, by cell."""
+    """Return the walls of two rooms with jagged sides, and their surroundings, by cell."""
     rng = np.random.default_rng(0)
     inside = np.zeros((90, 140), bool)
     inside[8:82, 8:66] = True

@@ -90,7 +90,7 @@ def scene_from_mujoco(  # noqa: PLR0913 - keyword options of a public call
 
     Args:
         model: The `mujoco.MjModel`.
-        data: Its `mujoco.MjData`; positions are read, not what is computed of them.
+        data: Its `mujoco.MjData`; positions are read, not quantities computed from them.
         robot: The robot: a name, the path of a URDF or robot.yaml, or a robot.
         joints: Coordinate of the robot → name of the model's joint, for names that differ.
             `base_x`, `base_y` and `base_yaw` are two slides and the hinge after them.

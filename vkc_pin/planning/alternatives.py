@@ -122,7 +122,7 @@ def _solve_steps(
             problem of the kind that is wanted.
     """
     task = compile_task(scene, steps, requests[0].options)
-    _check_terms_kept(requests[0].terms, original, task)
+    _check_phases_of_terms(requests[0].terms, original, task)
     if find_shared_coordinate(scene, task.holds) is None:
         return (yield from solve(scene, task, requests, check_goals_first=True))
     if plan_step_by_step is None:
@@ -130,7 +130,7 @@ def _solve_steps(
     return (yield from plan_step_by_step(scene, task, requests[0]))
 
 
-def _check_terms_kept(terms: Iterable[Term], original: Task, alternative: Task) -> None:
+def _check_phases_of_terms(terms: Iterable[Term], original: Task, alternative: Task) -> None:
     """Check that an alternative has all phases of a task that terms name.
 
     Phases are named after attachments: without them, a constraint would not hold anywhere.

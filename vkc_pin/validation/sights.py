@@ -14,7 +14,7 @@ from vkc_pin.world.collision.batched_model import BatchedModel
 from vkc_pin.world.models.shapes import compute_bounding_box, compute_shape_distance
 from vkc_pin.world.task.terms import Sight
 
-# [m] at the ends of a line of sight that do not count: the camera's housing, and what is seen
+# [m] at the ends of a line of sight that do not count: of the camera's housing, and of the target
 _HOUSING = 0.05
 _SEEN = 0.1
 _THICKNESS = 1e-4  # [m], radius of the capsule that stands for a line

@@ -147,7 +147,7 @@ BOX = f"s\n* a\n0 0 0 0 0 0 1\n1\nbox\n1 1 1\n0 0 0 0 0 0 1\n{NO_COLOUR}\n0\n.\n
         ("box\n1 1 1", "box\n1 one 1", ":6: a, shape 1: not a number .*got one"),
         ("box\n1 1 1", "box\n1 nan 1", ":6: a, shape 1: out of range .*got nan"),
         ("0 0 0 0 0 0 1\n1", "0 0 0 0 0 0 2\n1", ":3: a: not a rotation"),
-        ("\n1\n", "\n-1\n", ":4: a: not a number of things .*got -1"),
+        ("\n1\n", "\n-1\n", ":4: a: not a count .*got -1"),
         ("\n.\n", "\n", ":10: the next object: the text ends early"),
         ("* a", "*a", r":2: the next object: unknown marker .*got \*a"),
         ("\n.\n", "\n* a\n", ":10: a: not a new name"),

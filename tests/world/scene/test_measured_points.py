@@ -78,6 +78,18 @@ def test_points_of_held_objects_are_removed() -> None:
     assert held.with_points([*POINTS, at_cup]).point_counts["points"].robot == 1
 
 
+def test_points_of_objects_are_removed_where_these_are() -> None:
+    scene = vkc.load_scene("drawer")
+    opened = scene.with_state("drawer", {"slide": 0.3})
+    counts = []
+    for known in (scene, opened):
+        shapes = {shape.name: shape for shape in make_world_shapes(known.objects["drawer"])}
+        center = shapes["tray_0"].placement.translation
+        counts.append(opened.with_points([*POINTS, center]).point_counts["points"])
+    assert [one.objects for one in counts] == [0, 1]
+    assert [one.kept for one in counts] == [4, 3]
+
+
 def test_document_restores_the_same_points(scene: vkc.Scene) -> None:
     changed = scene.with_points(POINTS, 0.02)
     restored = vkc.Scene.from_document(changed.document, changed.folder)

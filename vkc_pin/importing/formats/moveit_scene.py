@@ -217,7 +217,7 @@ class _Reader:
     def _read_count(self, what: str) -> int:
         word = self._read_word(what)
         if not (word.isascii() and word.isdigit() and len(word) < 10):
-            raise self._make_error("not a number of things", what, word)
+            raise self._make_error("not a count", what, word)
         return int(word)
 
     def _read_word(self, what: str) -> str:

@@ -12,7 +12,7 @@ from vkc_pin.planning.base_paths.arcs import interpolate_arcs
 from vkc_pin.planning.retiming.braking import make_accelerating_curve, make_braking_curve
 from vkc_pin.planning.retiming.cubic_path import CubicPath
 from vkc_pin.planning.retiming.limits import Limits, limit_jerk
-from vkc_pin.planning.retiming.spline_path import fit_path, fit_path_at
+from vkc_pin.planning.retiming.spline_path import fit_path, fit_path_over
 from vkc_pin.planning.retiming.topp_ra import PathSamples, compute_speeds
 from vkc_pin.planning.retiming.torque_bounds import TorqueBounds
 from vkc_pin.planning.retiming.wheeled_paths import compute_slip, fit_rolling_paths
@@ -269,7 +269,7 @@ def _retime_between_velocities(
         first, last = end_speeds.tolist()
         first_slope = velocities[0] / first if first > 0.0 else None
         last_slope = velocities[1] / last if last > 0.0 else None
-        path = fit_path_at(positions, points, bounds, (first_slope, last_slope))
+        path = fit_path_over(positions, points, bounds, (first_slope, last_slope))
         steps = len(points) - 1
         return _follow_between_speeds(path, steps, velocities, (first, last), limits, torque_bounds)
 

@@ -26,14 +26,14 @@ def fit_path(
         points: Waypoints, shape (m, n), m ≥ 2, consecutive ones distinct.
         scale: Weight of each coordinate in the length, shape (n,).
         limits: Lower and upper limits, shape (n,) each.
-        end_slopes: Given derivatives by the length at the ends; see `fit_path_at`.
+        end_slopes: Given derivatives by the length at the ends; see `fit_path_over`.
     """
     lengths = np.linalg.norm(np.diff(points, axis=0) * scale, axis=1)
     arc_lengths = np.concatenate([[0.0], np.cumsum(lengths)])
-    return fit_path_at(arc_lengths, points, limits, end_slopes)
+    return fit_path_over(arc_lengths, points, limits, end_slopes)
 
 
-def fit_path_at(
+def fit_path_over(
     positions: Floats,
     points: Floats,
     limits: tuple[Floats, Floats],

@@ -298,7 +298,7 @@ def _decompress(data: bytes, expected_size: int, file: Path) -> bytes:
             position += 1
             if begin < 0:
                 raise IndexError
-            for k in range(begin, begin + length + 2):  # may overlap what it writes
+            for k in range(begin, begin + length + 2):  # the copied bytes may overlap their source
                 out.append(out[k])
     except IndexError:
         raise InputError(problem, file=file, expected=f"{size} bytes", got=len(out)) from None

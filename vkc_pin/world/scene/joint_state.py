@@ -91,7 +91,7 @@ class JointState:
     Attributes:
         positions: Joint → position, [rad] or [m].
         base: x, y [m] and yaw [rad] of the base, shape (3,), if the message states it.
-        notes: What the message states beside these.
+        notes: Further contents of the message, which are left out.
     """
 
     positions: Mapping[str, float]

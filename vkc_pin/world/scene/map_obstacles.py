@@ -113,7 +113,7 @@ def merge_cells(cells: Bools, most: int) -> Ints | None:
     """Return few rectangles that cover exactly the given cells; None if there are too many.
 
     Rectangles may overlap. From the cell with the longest run of cells on, each cell that is not
-    covered yet is extended first along its row and then across, or the other way round, whichever
+    covered yet is extended first along its row and then across, or in the opposite order, whichever
     covers more new cells. Rectangles that later ones cover are left out.
 
     Args:

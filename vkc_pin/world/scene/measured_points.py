@@ -1,15 +1,17 @@
-"""Adds measured points to a scene: their frame, what they show of the robot, and their record."""
+"""Adds measured points to a scene: their frame, the removal of known ones, and their record."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+import coal
 import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import check_array, check_choice
-from vkc_pin.utils.arrays import Floats
+from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.world.collision.distances import find_near_points
 from vkc_pin.world.collision.point_cloud import divide_points
 from vkc_pin.world.collision.solids import convert_solid, flatten_placements
@@ -21,23 +23,24 @@ if TYPE_CHECKING:
     from vkc_pin.world.models.robot import Robot
     from vkc_pin.world.scene import scene_schema as schema
 
-ROBOT_DISTANCE = 0.03
-"""Points this close to the robot or a held object at the start count as theirs [m]."""
+OWN_DISTANCE = 0.03
+"""Points this close to the robot or an object at the start count as theirs [m]."""
 FLOOR_HEIGHT = 0.05
 """Points below this height count as the floor's, where a scene has one [m]."""
 _LARGEST = 1e4  # [m] of coordinates: single precision resolves 1 mm there
 
 
-Reason = Literal["robot", "floor", "not_finite"]
+Reason = Literal["robot", "objects", "floor", "not_finite"]
 
 
 class Surroundings(NamedTuple):
-    """What points are compared with: the robot at its start, what it holds, and the floor."""
+    """The robot at its start, objects and the floor, whose points are no obstacles."""
 
     robot: Robot
     start: Floats
     opening: float | None
     held: tuple[PlacedObject, ...]
+    others: tuple[PlacedObject, ...]
     floor: bool
 
 
@@ -47,12 +50,14 @@ class PointCounts(NamedTuple):
     Attributes:
         kept: Points that are obstacles.
         robot: Points that were removed within 3 cm of the robot or a held object at the start.
+        objects: Points that were removed within 3 cm of other objects as they are.
         floor: Points that were removed below 5 cm above the floor.
         not_finite: Points of a file that were removed since they are not finite.
     """
 
     kept: int
     robot: int = 0
+    objects: int = 0
     floor: int = 0
     not_finite: int = 0
 
@@ -115,12 +120,12 @@ def find_frame_placement(robot: Robot, start: Floats, frame: Any) -> pin.SE3:
 def remove_known_points(
     points: Floats, radius: float, around: Surroundings
 ) -> tuple[Floats, PointCounts]:
-    """Return points without those of the robot, of what it holds and of the floor.
+    """Return points without those of the robot, of objects and of the floor.
 
     Args:
         points: Finite points in the world frame, shape (n, 3) [m].
         radius: Radius of each [m].
-        around: What they are compared with.
+        around: Shapes whose points are removed.
 
     Raises:
         InputError: No point is left.
@@ -130,38 +135,54 @@ def remove_known_points(
     is_floor = np.zeros(len(points), bool)
     if around.floor:
         is_floor = points[:, 2] < FLOOR_HEIGHT
-    is_robot = ~is_floor & _find_robot_points(points, radius, around)
-    is_kept = ~(is_floor | is_robot)
+    robot_shapes = [*_place_robot(around), *_place_objects(around.held)]
+    is_robot = ~is_floor & _find_own_points(points, radius, robot_shapes)
+    object_shapes = _place_objects(around.others)
+    is_object = ~(is_floor | is_robot) & _find_own_points(points, radius, object_shapes)
+    is_kept = ~(is_floor | is_robot | is_object)
     counts = PointCounts(
         kept=int(np.count_nonzero(is_kept)),
         robot=int(np.count_nonzero(is_robot)),
+        objects=int(np.count_nonzero(is_object)),
         floor=int(np.count_nonzero(is_floor)),
     )
     if not counts.kept:
         raise InputError(
-            f"no points are left: {counts.robot} are within {ROBOT_DISTANCE} m of the robot or of "
-            f"what it holds, {counts.floor} below {FLOOR_HEIGHT} m above the floor",
+            f"no points are left: {counts.robot} are within {OWN_DISTANCE} m of the robot or of a "
+            f"held object, {counts.objects} of other objects, {counts.floor} below "
+            f"{FLOOR_HEIGHT} m above the floor",
             field="points",
             expected="points of obstacles in the world frame",
         )
     return points[is_kept], counts
 
 
-def _find_robot_points(points: Floats, radius: float, around: Surroundings) -> Any:
-    """Return which points are near the robot or a held object, shape (n,)."""
+_Shape = tuple[coal.CollisionGeometry, pin.SE3]
+
+
+def _place_robot(around: Surroundings) -> list[_Shape]:
+    """Return the shapes of the robot at its start, in the world frame."""
     robot = around.robot
     geometry = robot.opened(robot.opening(around.opening)).collision
     geometry_data = geometry.createData()
     q = robot.coordinates.q(around.start)
     pin.updateGeometryPlacements(robot.model, robot.model.createData(), geometry, geometry_data, q)
-    shapes = [
-        (shape.geometry, placement)
-        for shape, placement in zip(geometry.geometryObjects, geometry_data.oMg, strict=True)
-    ]
-    for placed in around.held:
-        shapes += [(shape.geometry, shape.placement) for shape in make_world_shapes(placed)]
+    geometries = [shape.geometry for shape in geometry.geometryObjects]
+    return list(zip(geometries, geometry_data.oMg, strict=True))
+
+
+def _place_objects(objects: Iterable[PlacedObject]) -> list[_Shape]:
+    """Return the shapes of objects in the world frame."""
+    found = list[_Shape]()
+    for placed in objects:
+        found += [(shape.geometry, shape.placement) for shape in make_world_shapes(placed)]
+    return found
+
+
+def _find_own_points(points: Floats, radius: float, shapes: Iterable[_Shape]) -> Bools:
+    """Return which points are near one of some shapes, shape (n,)."""
     is_near = np.zeros(len(points), bool)
-    reach = ROBOT_DISTANCE + radius
+    reach = OWN_DISTANCE + radius
     for shape, placement in shapes:
         lower, upper = compute_world_box(shape, placement)
         is_in_box = ((points > lower - reach) & (points < upper + reach)).all(axis=1)
@@ -199,15 +220,17 @@ def get_counts(item: schema.PointsSchema) -> PointCounts:
     return PointCounts(
         kept=len(decode_points(item.data)),
         robot=removed.get("robot", 0),
+        objects=removed.get("objects", 0),
         floor=removed.get("floor", 0),
         not_finite=removed.get("not_finite", 0),
     )
 
 
-def describe_removed(counts: PointCounts) -> dict[Reason, int]:
+def summarize_removals(counts: PointCounts) -> dict[Reason, int]:
     """Return the numbers of removed points, without zeros."""
     removed: dict[Reason, int] = {
         "robot": counts.robot,
+        "objects": counts.objects,
         "floor": counts.floor,
         "not_finite": counts.not_finite,
     }

@@ -425,9 +425,9 @@ class Scene:
     ) -> Scene:
         """Return the scene with measured points as an obstacle, each a ball of a radius.
 
-        Points of the robot at its start and of what it holds (within 3 cm), and of the floor (below
-        5 cm), are removed; `point_counts` has their numbers. Points of articulated objects are not:
-        leave these out. Coordinates are kept in single precision.
+        Points of the robot at its start and of objects as they are (within 3 cm), and of the floor
+        (below 5 cm), are removed; `point_counts` has their numbers. Coordinates are kept in single
+        precision.
 
         Args:
             points: Points, shape (n, 3) [m].

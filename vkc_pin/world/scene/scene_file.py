@@ -40,8 +40,8 @@ from vkc_pin.world.scene.map_obstacles import MAP, MapObstacle
 from vkc_pin.world.scene.measured_points import (
     PointCounts,
     Surroundings,
-    describe_removed,
     remove_known_points,
+    summarize_removals,
 )
 from vkc_pin.world.scene.obstacles import (
     FLOOR,
@@ -131,8 +131,10 @@ def find_surroundings(
 ) -> Surroundings:
     """Return what measured points are compared with; the arguments are attributes of a scene."""
     placed = place_held_objects(objects, lambda: compute_tool_placement(robot, start), holds)
-    held = tuple(placed[hold.object] for hold in holds)
-    return Surroundings(robot, start, opening, held, floor)
+    names = [hold.object for hold in holds]
+    held = tuple(placed[name] for name in names)
+    others = tuple(one for name, one in placed.items() if name not in names)
+    return Surroundings(robot, start, opening, held, others, floor)
 
 
 def add_points(
@@ -153,7 +155,7 @@ def add_points(
         type="points",
         radius=radius,
         data=encode_points(points),
-        removed=describe_removed(counts),
+        removed=summarize_removals(counts),
     )
     others = [one for one in described.obstacles if one.name != name]
     changed = {"described": described.model_copy(update={"obstacles": (*others, item)})}
@@ -716,7 +718,7 @@ def _load_points(
             "file": None,
             "radius": radius,
             "data": encode_points(in_frame),
-            "removed": describe_removed(counts),
+            "removed": summarize_removals(counts),
         }
         obstacles[index] = item.model_copy(update=update)
     return description.model_copy(update={"obstacles": tuple(obstacles)})

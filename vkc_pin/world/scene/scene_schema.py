@@ -195,11 +195,14 @@ def _check_encoded_points(value: str) -> bool:
     return bool(0 < len(points) <= MAX_POINTS and np.isfinite(points).all())
 
 
+_Removal = Literal["robot", "objects", "floor", "not_finite"]
+
+
 class PointsSchema(ShapeSchema):
     """Measured points of one radius, from a file or, as saved scenes have them, as `data`.
 
     `position` and orientation are those of the frame of the points. Of the points of a file, those
-    of the robot at its start, of what it holds and of the floor are `removed`, with their numbers.
+    of the robot at its start, of objects and of the floor are `removed`, with their numbers.
     """
 
     type: Literal["points"]
@@ -215,7 +218,7 @@ class PointsSchema(ShapeSchema):
         ]
         | None
     ) = None
-    removed: Mapping[Literal["robot", "floor", "not_finite"], Count] = Field(default_factory=dict)
+    removed: Mapping[_Removal, Count] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _check_file_or_data(self) -> PointsSchema:

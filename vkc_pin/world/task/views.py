@@ -52,7 +52,7 @@ def keep_in_view(
     Args:
         scene: The scene in which the term is used.
         camera: The camera.
-        target: What it sees.
+        target: The point to be seen.
         name: Name in reports. Default: `<camera> sees <target>`.
         during: Names of phases in which it holds; see `Constraint`.
         holding: Object that must be held for it; see `Constraint`.
@@ -107,7 +107,7 @@ def prefer_in_view(
     Args:
         scene: The scene in which the term is used.
         camera: The camera.
-        target: What it should look at.
+        target: The point at which it looks.
         weight: Weight of the sum over the waypoints; see `Cost`.
         name: Name in error messages. Default: `<camera> looks at <target>`.
         during: Names of phases in which it counts; see `Cost`.

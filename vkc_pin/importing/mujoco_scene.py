@@ -35,6 +35,7 @@ from vkc_pin.simulation.robot_in_model import (
     RobotInModel,
     check_data,
     check_model,
+    copy_positions,
 )
 from vkc_pin.utils.arguments import (
     check_bool,
@@ -126,10 +127,7 @@ def scene_from_mujoco(  # noqa: PLR0913 - keyword options of a public call
     loaded_robot = _load_robot(robot, base, model_joints)
     found = RobotInModel(model, loaded_robot, model_joints, body=robot_body)
     _check_known(model_joints, loaded_robot)
-    placed = mujoco.MjData(model)
-    placed.qpos[:] = data.qpos
-    placed.mocap_pos[:] = data.mocap_pos
-    placed.mocap_quat[:] = data.mocap_quat
+    placed = copy_positions(model, data)
     mujoco.mj_kinematics(model, placed)
     height = _find_floor(mujoco, model, placed) if floor is None else floor
     height = check_number(height, "floor", "a height [m]", low=-_LARGEST, high=_LARGEST)

@@ -11,7 +11,13 @@ import pinocchio as pin
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.simulation.model import to_mujoco_quaternion
-from vkc_pin.simulation.robot_in_model import ModelJoints, RobotInModel, check_data, check_model
+from vkc_pin.simulation.robot_in_model import (
+    ModelJoints,
+    RobotInModel,
+    check_data,
+    check_model,
+    copy_positions,
+)
 from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.utils.words import clean_name
 from vkc_pin.world.scene.scene import Scene
@@ -78,23 +84,7 @@ def make_mujoco_motion(
     joints: Mapping[str, str] | None = None,
     robot_body: str | None = None,
 ) -> MujocoMotion:
-    """Return a motion in the coordinates of a model, as `Plan.to_mujoco` does.
-
-    Args:
-        scene: Scene of the motion.
-        trajectory: The motion.
-        model: The `mujoco.MjModel`.
-        rate: Samples a second [Hz]; the end is one more.
-        data: `mujoco.MjData` with the positions and controls of all that does not move; defaults
-            to `model.qpos0` and 0.
-        joints: Coordinate of the robot, or "<object>.<joint>" → name of the model's joint, for
-            names that differ.
-        robot_body: Body that carries the robot; see `scene_from_mujoco`.
-
-    Raises:
-        UnknownNameError: A coordinate has no joint in the model.
-        InputError: The model has another robot, or it stands elsewhere.
-    """
+    """Return a motion of a scene in the coordinates of a model; see `Plan.to_mujoco`."""
     mujoco = check_model(model)
     if data is not None:
         check_data(model, data)
@@ -120,15 +110,12 @@ class _Writer:
         self._scene = scene
         self._joints = ModelJoints(model, joints)
         self._robot = RobotInModel(model, scene.robot, self._joints, body=robot_body)
-        self._data = mujoco.MjData(model)
-        self._data.qpos[:] = model.qpos0 if data is None else data.qpos
-        if data is not None:
-            self._data.mocap_pos[:] = data.mocap_pos
-            self._data.mocap_quat[:] = data.mocap_quat
+        # New data have the positions `qpos0`.
+        self._data = mujoco.MjData(model) if data is None else copy_positions(model, data)
         self._ctrl = np.zeros(model.nu) if data is None else np.array(data.ctrl)
         self._world = World(scene)
         self._notes = list[str]()
-        self._check_given()
+        self._check_joint_names()
 
     def write(self, trajectory: Trajectory, times: Floats) -> MujocoMotion:
         """Return the motion at some times."""
@@ -161,7 +148,7 @@ class _Writer:
             _columns=addresses,
         )
 
-    def _check_given(self) -> None:
+    def _check_joint_names(self) -> None:
         """Check that `joints` names coordinates of the scene alone."""
         robot = self._scene.robot
         known = [*self._world.coordinates.names]

@@ -41,6 +41,15 @@ def check_data(model: Any, data: Any) -> None:
         raise InputError(problem, field="data", expected=f"{model.nq} qpos", got=len(data.qpos))
 
 
+def copy_positions(model: Any, data: Any) -> Any:
+    """Return new `mujoco.MjData` of a model with the positions of `data`, and nothing computed."""
+    copy = import_mujoco().MjData(model)
+    copy.qpos[:] = data.qpos
+    copy.mocap_pos[:] = data.mocap_pos
+    copy.mocap_quat[:] = data.mocap_quat
+    return copy
+
+
 def _check_type(value: Any, kind: Any, field: str) -> None:
     if not isinstance(value, kind):
         raise InputError(
@@ -341,7 +350,7 @@ class RobotInModel:
         gaps = np.einsum("kij,kj->ki", projections, model_anchors - rotated)[is_hinge].ravel()
         translation, _, rank, _ = np.linalg.lstsq(rows, gaps, rcond=_LEAST_SINGULAR)
         if rank < 3:
-            self._raise_undetermined()
+            raise self._make_undetermined_error()
         directions = np.linalg.norm(np.array(axes) @ rotation.T - model_axes, axis=1)
         offsets = np.einsum("kij,kj->ki", projections, rotated + translation - model_anchors)
         distances = np.where(is_hinge, np.linalg.norm(offsets, axis=1), 0.0)
@@ -353,12 +362,12 @@ class RobotInModel:
         left, values, right = np.linalg.svd(model_axes.T @ axes)
         # Two axes that are not parallel determine a rotation.
         if len(axes) < 2 or values[1] < _LEAST_SINGULAR * values[0]:
-            self._raise_undetermined()
+            raise self._make_undetermined_error()
         flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
         return np.asarray(left @ flip @ right)
 
-    def _raise_undetermined(self) -> None:
-        raise InputError(
+    def _make_undetermined_error(self) -> InputError:
+        return InputError(
             f"the axes of robot '{self._robot.name}' do not determine where its base is",
             field="robot",
             expected="hinges with axes that are not parallel",

@@ -34,10 +34,11 @@ def find_occlusions(samples: Samples, sight: Sight, rows: Ints) -> Iterator[tupl
     model = world.model
     camera = model.frames[model.getFrameId(sight.frame)]
     robot_shapes = len(world.scene.robot.collision.geometryObjects)
-    numbers = list[int]()
+    boxes = dict[int, tuple[Floats, float]]()  # by shape: centre in its frame, and radius around it
     for number, shape in enumerate(world.bodies.geometryObjects[:robot_shapes]):
         if shape.parentJoint != camera.parentJoint:
-            numbers.append(number)
+            center, half = compute_bounding_box(shape)
+            boxes[number] = (center, float(np.linalg.norm(half)))
     configurations = world.coordinates.q(samples.z[rows])
     placements = BatchedModel.of_shapes(model, world.bodies)
     rotations, origins = placements.compute_poses(configurations)
@@ -52,15 +53,14 @@ def find_occlusions(samples: Samples, sight: Sight, rows: Ints) -> Iterator[tupl
         middle = begins[row] + direction * (_HOUSING + length / 2.0)
         line = coal.Capsule(_THICKNESS, length / 2.0)
         along = pin.SE3(pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), direction), middle)
-        for number in numbers:
-            shape = world.bodies.geometryObjects[number]
-            center, half = compute_bounding_box(shape)
+        for number, (center, radius) in boxes.items():
             at = pin.SE3(rotations[row, number], origins[row, number])
             offset = at.act(center) - middle
             beside = offset - np.clip(offset @ direction, -length / 2.0, length / 2.0) * direction
-            if np.linalg.norm(beside) > np.linalg.norm(half):
+            if np.linalg.norm(beside) > radius:
                 continue
-            if compute_shape_distance(line, along, shape.geometry, at) <= 0.0:
+            solid = world.bodies.geometryObjects[number].geometry
+            if compute_shape_distance(line, along, solid, at) <= 0.0:
                 yield int(rows[row]), world.collision_labels[number]
                 break
 

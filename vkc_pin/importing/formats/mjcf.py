@@ -24,6 +24,7 @@ from vkc_pin.importing.description import (
     make_limits,
 )
 from vkc_pin.importing.formats.mjcf_compiler import NO_MASS, compile_mjcf
+from vkc_pin.simulation.robot_in_model import copy_positions
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.optional_imports import import_optional
 
@@ -77,10 +78,7 @@ def read_compiled_model(model: Any, data: Any) -> CompiledModel:
     """
     mujoco = import_optional("mujoco", "sim", purpose="reading a compiled model")
     scalar = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-    at_zero = mujoco.MjData(model)
-    at_zero.qpos[:] = data.qpos
-    at_zero.mocap_pos[:] = data.mocap_pos
-    at_zero.mocap_quat[:] = data.mocap_quat
+    at_zero = copy_positions(model, data)
     addresses = dict[int, int]()  # in `qpos` of each hinge and slide
     for joint in range(model.njnt):
         if int(model.jnt_type[joint]) in scalar:
@@ -89,7 +87,7 @@ def read_compiled_model(model: Any, data: Any) -> CompiledModel:
         at_zero.qpos[address] = model.qpos0[address]
     mujoco.mj_kinematics(model, at_zero)
     name = bytes(model.names).split(b"\0", 1)[0].decode() or "model"
-    reader = _Reader(mujoco, model, at_zero, Path(name), [], ghosts=False)
+    reader = _Reader(mujoco, model, at_zero, Path(name), [], keeps_intangible=False)
     positions = dict[str, float]()
     for joint, address in addresses.items():
         positions[reader.find_joint_name(joint)] = float(data.qpos[address] - model.qpos0[address])
@@ -106,7 +104,7 @@ class _Reader:
             `model.qpos0`.
         file: The file, for messages.
         notes: Notes, to which changes and omissions are added.
-        ghosts: Whether bodies that collide with nothing keep their visual shapes.
+        keeps_intangible: Whether bodies that collide with nothing keep their visual shapes.
     """
 
     def __init__(
@@ -117,9 +115,9 @@ class _Reader:
         file: Path,
         notes: list[str],
         *,
-        ghosts: bool = True,
+        keeps_intangible: bool = True,
     ) -> None:
-        self._ghosts = ghosts
+        self._keeps_intangible = keeps_intangible
         self._paired = {int(geom) for geom in (*model.pair_geom1, *model.pair_geom2)}
         self._mujoco = mujoco
         self._model = model
@@ -299,7 +297,7 @@ class _Reader:
                 collision.append(part)
             if int(model.geom_group[geom]) < _HIDDEN or not collides:
                 visual.append(part)
-        if not collision and not self._ghosts:
+        if not collision and not self._keeps_intangible:
             return (), ()
         return tuple(visual or collision), tuple(collision)
 

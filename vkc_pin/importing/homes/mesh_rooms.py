@@ -104,16 +104,13 @@ def _find_floor(mesh: trimesh.Trimesh, file: Path) -> float:
 
 def _split(mesh: trimesh.Trimesh, is_kept: Bools) -> list[trimesh.Trimesh]:
     """Return the connected surfaces of some faces, the largest first."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
+    from trimesh.graph import connected_component_labels
 
     kept = np.flatnonzero(is_kept)
     corners = mesh.faces[kept]
     # Faces that share a vertex are connected.
-    ends = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]]])
-    size = len(mesh.vertices)
-    graph = coo_matrix((np.ones(len(ends), bool), ends.T), shape=(size, size))
-    _, label_by_vertex = connected_components(graph, directed=False)
+    edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]]])
+    label_by_vertex = connected_component_labels(edges, node_count=len(mesh.vertices))
     labels = label_by_vertex[corners[:, 0]]
     order = np.argsort(labels, kind="stable")
     boundaries = np.flatnonzero(np.diff(labels[order])) + 1

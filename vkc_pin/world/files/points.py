@@ -14,6 +14,7 @@ import numpy as np
 
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.files.documents import read_bytes
 from vkc_pin.world.files.octomap import read_octomap
 from vkc_pin.world.files.resources import check_path
 
@@ -81,11 +82,7 @@ def read_points(path: str | Path) -> PointFile:
         raise InputError("unknown format of points", file=file, expected=expected, got=kind)
     if not file.is_file():
         raise InputError("there is no such file", file=file, field="path", expected="a file")
-    size = file.stat().st_size
-    if size > MAX_FILE_SIZE:
-        expected = f"at most {MAX_FILE_SIZE} bytes"
-        raise InputError("the file is too large", file=file, expected=expected, got=size)
-    content = file.read_bytes()
+    content = read_bytes(file, "file of points", MAX_FILE_SIZE)
     radius = None
     if kind in (".bt", ".ot"):
         points, radius = read_octomap(content, file)

@@ -325,9 +325,14 @@ def get_attachment(objects: Mapping[str, PlacedObject], hold: Hold) -> Attachmen
 
 def compute_tool_placement(robot: Robot, start: Floats) -> pin.SE3:
     """Return the placement of the tool frame in the world at a configuration, shape (n,)."""
+    return compute_frame_placement(robot, start, robot.tool_frame)
+
+
+def compute_frame_placement(robot: Robot, start: Floats, frame: str) -> pin.SE3:
+    """Return the placement of a frame of the robot in the world at a configuration, shape (n,)."""
     data = robot.model.createData()
     pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(start))
-    return data.oMf[robot.model.getFrameId(robot.tool_frame)].copy()
+    return data.oMf[robot.model.getFrameId(frame)].copy()
 
 
 def measure_grasp(

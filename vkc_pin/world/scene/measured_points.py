@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import InputError
-from vkc_pin.utils.arguments import check_array, check_choice
+from vkc_pin.utils.arguments import check_array
 from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.world.collision.distances import find_near_points
 from vkc_pin.world.collision.point_cloud import divide_points
@@ -106,15 +106,6 @@ def check_count(points: Floats, field: str | None, file: Any = None) -> None:
             expected=f"coordinates up to {_LARGEST:g} m",
             got=points[first].tolist(),
         )
-
-
-def find_frame_placement(robot: Robot, start: Floats, frame: Any) -> pin.SE3:
-    """Return the placement of a link or frame of the robot in the world at its start."""
-    names = [one.name for one in robot.model.frames if one.name != "universe"]
-    name = check_choice(frame, names, f"frame of robot '{robot.name}'", "frame")
-    data = robot.model.createData()
-    pin.framesForwardKinematics(robot.model, data, robot.coordinates.q(start))
-    return data.oMf[robot.model.getFrameId(name)].copy()
 
 
 def remove_known_points(

@@ -37,6 +37,7 @@ from vkc_pin.world.scene.estimated_joints import place_on_estimate
 from vkc_pin.world.scene.hold import (
     Hold,
     check_hold_order,
+    compute_frame_placement,
     compute_tool_placement,
     find_reversed_approaches,
     make_holds,
@@ -445,7 +446,6 @@ class Scene:
         """
         from vkc_pin.world.scene.measured_points import (
             check_points,
-            find_frame_placement,
             remove_known_points,
         )
         from vkc_pin.world.scene.scene_file import add_points, find_surroundings
@@ -461,7 +461,9 @@ class Scene:
             )
         self._check_points_name(name)
         if frame is not None:
-            pose = find_frame_placement(self.robot, self.start, frame)
+            kind = f"frame of robot '{self.robot.name}'"
+            known = check_choice(frame, self.robot.frame_names, kind, "frame")
+            pose = compute_frame_placement(self.robot, self.start, known)
             measured = measured @ pose.rotation.T + pose.translation
         around = find_surroundings(
             robot=self.robot,

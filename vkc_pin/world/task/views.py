@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self
 
 import casadi as ca
 import numpy as np
+import pinocchio as pin
 
 from vkc_pin.errors import InputError, UnknownNameError
 from vkc_pin.utils.arguments import check_finite_array, check_instance, check_number
@@ -65,10 +67,9 @@ def keep_in_view(
         UnknownNameError: The robot lacks the camera's frame, or the scene the target.
     """
     near_hand = check_number(until, "until", "a distance [m]", low=0.0)
-    project, sight, label = _make_projection(scene, camera, target, near_hand)
-    free = np.radians(
-        check_number(margin, "margin", "an angle [deg]", low=0.0, high=camera.fov / 2)
-    )
+    view = _View.of(scene, camera, target)
+    largest = camera.fov / 2.0
+    free = np.radians(check_number(margin, "margin", "an angle [deg]", low=0.0, high=largest))
     near = check_number(nearest, "nearest", "a depth [m]", low=0.0)
     half_height = np.radians(camera.fov) / 2.0
     half_width = np.arctan(np.tan(half_height) * camera.width / camera.height)
@@ -77,18 +78,18 @@ def keep_in_view(
 
     def compute_excess(state: State) -> Any:
         """Return by how much the point is outside each side of the frustum [m]."""
-        x, y, depth, gap = project(state)
+        x, y, depth = view.project(state)
         sides = [x - width * depth, -x - width * depth, y - height * depth, -y - height * depth]
-        slack = _SLACK * ca.fmax(near_hand - gap, 0.0)
+        slack = _SLACK * ca.fmax(near_hand - view.measure_gap(state), 0.0)
         return ca.vertcat(near - depth, *sides) - slack
 
     return Constraint(
-        name or f"{camera.name} sees {label}",
+        name or f"{camera.name} sees {view.label}",
         compute_excess,
         upper=0.0,
         during=during,
         holding=holding,
-        sight=sight,
+        sight=view.make_sight(near_hand),
     )
 
 
@@ -117,14 +118,14 @@ def prefer_in_view(
         InputError: An argument is invalid.
         UnknownNameError: The robot lacks the camera's frame, or the scene the target.
     """
-    project, _, label = _make_projection(scene, camera, target, 0.0)
+    view = _View.of(scene, camera, target)
 
     def compute_cost(state: State) -> Any:
-        x, y, depth, _ = project(state)
+        x, y, depth = view.project(state)
         return 1.0 - depth / ca.sqrt(x**2 + y**2 + depth**2 + ROUNDING)
 
     return Cost(
-        name or f"{camera.name} looks at {label}",
+        name or f"{camera.name} looks at {view.label}",
         compute_cost,
         weight=weight,
         during=during,
@@ -132,33 +133,57 @@ def prefer_in_view(
     )
 
 
-def _make_projection(
-    scene: Scene, camera: Camera, target: Target, until: float
-) -> tuple[Callable[[State], tuple[Any, Any, Any, Any]], Sight, str]:
-    """Return the position of a target in a camera's axes as a function, its sight and its name.
+@dataclass(frozen=True, eq=False)
+class _View:
+    """A camera of a robot and its target.
 
-    The position is x to the right, y upwards and the depth; with them comes the distance from the
-    tool frame [m].
+    Attributes:
+        frame: Frame of the robot on which the camera is mounted.
+        placement: Placement of the camera in it; see `Camera.placement`.
+        target: Frame of the target; "": the world.
+        point: Position of the target in its frame, shape (3,) [m].
+        label: The target in reports.
+        hand: Tool frame.
     """
-    check_instance(camera, Camera, "camera")
-    frame = camera.find_frame(scene.robot)
-    target_frame, point, label = _find_target(scene, target)
-    placement = camera.placement
-    x, y, z = point.tolist()
-    hand = scene.robot.tool_frame
-    sight = Sight(frame, camera.position, target_frame, (x, y, z), hand, until)
 
-    def project(state: State) -> tuple[Any, Any, Any, Any]:
-        rotation = state.rotation(frame) @ placement.rotation
-        origin = state.position(frame) + state.rotation(frame) @ placement.translation
-        place = ca.SX(point)
-        if target_frame:
-            place = state.position(target_frame) + state.rotation(target_frame) @ point
-        inside = rotation.T @ (place - origin)
-        gap = ca.norm_2(place - state.position(hand))
-        return inside[0], inside[1], -inside[2], gap
+    frame: str
+    placement: pin.SE3
+    target: str
+    point: Floats
+    label: str
+    hand: str
 
-    return project, sight, label
+    @classmethod
+    def of(cls, scene: Scene, camera: Camera, target: Target) -> Self:
+        """Return the view of a target in a scene."""
+        check_instance(camera, Camera, "camera")
+        frame = camera.find_frame(scene.robot)
+        target_frame, point, label = _find_target(scene, target)
+        return cls(frame, camera.placement, target_frame, point, label, scene.robot.tool_frame)
+
+    def project(self, state: State) -> tuple[Any, Any, Any]:
+        """Return the target in the camera's axes: x to the right, y upwards and depth [m]."""
+        rotation = state.rotation(self.frame)
+        origin = state.position(self.frame) + rotation @ self.placement.translation
+        axes = rotation @ self.placement.rotation
+        inside = axes.T @ (self._locate(state) - origin)
+        return inside[0], inside[1], -inside[2]
+
+    def measure_gap(self, state: State) -> Any:
+        """Return the distance of the target from the tool frame [m]."""
+        return ca.norm_2(self._locate(state) - state.position(self.hand))
+
+    def make_sight(self, until: float) -> Sight:
+        """Return the line of sight; see `Sight`."""
+        u, v, w = self.placement.translation.tolist()
+        x, y, z = self.point.tolist()
+        return Sight(self.frame, (u, v, w), self.target, (x, y, z), self.hand, until)
+
+    def _locate(self, state: State) -> Any:
+        """Return the position of the target in the world, shape (3, 1) [m]."""
+        if not self.target:
+            return ca.SX(self.point)
+        return state.position(self.target) + state.rotation(self.target) @ self.point
 
 
 def _find_target(scene: Scene, target: Target) -> tuple[str, Floats, str]:

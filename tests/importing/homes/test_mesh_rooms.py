@@ -84,12 +84,12 @@ def test_robot_drives_round_what_stands_in_a_scanned_room(tmp_path: Path) -> Non
     assert home.scene.obstacle_names == ("walls_0", "furniture_1")
     assert home.shapes == {"file": 3, "obstacles": 2, "objects": 0, "floor": 1}
     solids = [(one.geometry, one.placement) for one in home.scene.obstacles]
-    check_surface_is_covered(room, FixedShapes(solids))
+    check_coverage(room, FixedShapes(solids))
     plan = vkc.plan(home.scene.with_start(base=[2.2, 0.8, 0.0]), [vkc.GoTo(4.3, 2.2, 0.0)])
     assert plan.success, plan.summary()
 
 
-def check_surface_is_covered(room: trimesh.Trimesh, shapes: FixedShapes) -> None:
+def check_coverage(room: trimesh.Trimesh, shapes: FixedShapes) -> None:
     """Check that obstacles contain the surface above the floor, and nothing else by much."""
 
     def is_near(place: np.ndarray, radius: float) -> bool:

@@ -123,7 +123,7 @@ def test_arena_is_the_bounding_box_of_the_turned_map(tmp_path: Path) -> None:
     c = 4.0 * math.cos(0.3)
     s = 4.0 * math.sin(0.3)
     np.testing.assert_allclose(scene.arena, [-2 - s, -2 + c, -1.5, -1.5 + s + c])
-    # Four walls, and what the turned image leaves of the arena on four sides.
+    # Four walls, and the parts of the arena beyond the four sides of the turned image.
     assert scene.obstacle_labels.count(MAP) == 8
     free = make_document(map={"file": "map.yaml", "unknown": "free"})
     assert vkc.Scene.from_document(free, tmp_path).obstacle_labels.count(MAP) == 4

@@ -122,7 +122,7 @@ def test_scene_file_names_a_file_of_points(scene: vkc.Scene, tmp_path: Path) -> 
     np.testing.assert_allclose(
         collect_points(loaded, "room"), sort_points(POINTS + np.array([0.0, 0.5, 0.0])), atol=1e-6
     )
-    # The document has the points themselves: what was removed does not depend on later starts.
+    # The document has the points themselves: removal does not depend on later starts.
     assert "file" not in loaded.document["obstacles"][0]
 
 

@@ -108,6 +108,14 @@ def check_coverage(room: trimesh.Trimesh, shapes: FixedShapes) -> None:
     assert not any(is_near(place, 1e-3) for place in far)
 
 
+def test_floor_is_not_a_larger_ceiling(tmp_path: Path) -> None:
+    room = make_room(noise=0.003)
+    ceiling = make_grid((-1, -1, HEIGHT), (WIDTH + 2, 0, 0), (0, DEPTH + 2, 0))
+    file = export(trimesh.util.concatenate([room, ceiling]), tmp_path / "flat.ply")
+    _, floor = read_mesh_room(file)
+    assert floor == pytest.approx(0.0, abs=0.002)
+
+
 def test_stated_height_of_the_floor_counts(tmp_path: Path) -> None:
     file = export(make_room(), tmp_path / "flat.ply")
     description, floor = read_mesh_room(file, 0.4)

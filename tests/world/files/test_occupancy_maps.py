@@ -73,6 +73,13 @@ def test_modes_have_the_values_of_nav2(
     assert read_occupancy_map(file).values.tolist() == [values]
 
 
+def test_values_at_the_thresholds_are_unknown(tmp_path: Path) -> None:
+    grey = np.array([[50, 51, 152, 153, 154]], np.uint8)  # 51 and 153 are 0.2 and 0.6 of 255
+    thresholds = {"free_thresh": 0.2, "occupied_thresh": 0.6}
+    file = write_map(tmp_path, Image.fromarray(grey), negate=1, **thresholds)
+    assert read_occupancy_map(file).values.tolist() == [[0, -1, -1, -1, 100]]
+
+
 def test_first_row_is_the_lowest_of_the_image(tmp_path: Path) -> None:
     grey = np.array([[0, 254], [254, 254], [205, 205]], np.uint8)
     found = read_occupancy_map(write_map(tmp_path, Image.fromarray(grey)))

@@ -8,13 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from helpers.expected_errors import expect_error
 from helpers.judging import get_violation_names
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import vkc_pin as vkc
 from vkc_pin.errors import UnknownNameError
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.task.terms import trace_terms
 
 STEPS = [vkc.Actuate("door", {"hinge": 0.6})]
 REACH = "reach door.handle"
@@ -113,6 +117,29 @@ def test_arm_in_front_of_the_target_is_a_violation() -> None:
         found = check(plan, term)
         texts = [one.detail for one in found.violations]
         assert any("in front of it" in text for text in texts) is is_hidden, texts
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_frustum_is_that_of_a_pinhole_camera(seed: int) -> None:
+    """Rays through the four corners of the image bound it, here wider than high."""
+    scene = load_facing_scene()
+    rng = np.random.default_rng(seed)
+    point = rng.uniform(-2.0, 2.0, 3)
+    term = vkc.keep_in_view(scene, FRONT, point, margin=0.0, nearest=0.0, until=0.0)
+    (traced,) = trace_terms(scene, [term])
+    base, tool = (
+        pin.SE3(pin.exp3(rng.normal(0.0, 2.0, 3)), rng.uniform(-2.0, 2.0, 3)) for _ in range(2)
+    )
+    inputs = [np.concatenate([one.rotation.T.ravel(), one.translation]) for one in (base, tool)]
+    frames = dict(zip((FRONT.find_frame(scene.robot), scene.robot.tool_frame), inputs, strict=True))
+    now = np.concatenate([frames[name] for name in traced.formula.frames])
+    (excess,) = traced.formula.evaluate(np.concatenate([now, now, [1.0]])[None])
+    x, y, z = (base * FRONT.placement).actInv(point)
+    focal_length = FRONT.height / 2.0 / np.tan(np.radians(FRONT.fov) / 2.0)  # [pixels]
+    pixels = np.abs([x, y]) / -z * focal_length
+    is_inside = z < 0.0 and (pixels < (FRONT.width / 2.0, FRONT.height / 2.0)).all()
+    assert bool(excess.max() < 0.0) is bool(is_inside)
 
 
 def test_plans_keep_the_line_of_sight_in_files(tmp_path: Path) -> None:

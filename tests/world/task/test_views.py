@@ -125,12 +125,13 @@ def test_frustum_is_that_of_a_pinhole_camera(seed: int) -> None:
     """Rays through the four corners of the image bound it, here wider than high."""
     scene = load_facing_scene()
     rng = np.random.default_rng(seed)
-    point = rng.uniform(-2.0, 2.0, 3)
-    term = vkc.keep_in_view(scene, FRONT, point, margin=0.0, nearest=0.0, until=0.0)
-    (traced,) = trace_terms(scene, [term])
     base, tool = (
         pin.SE3(pin.exp3(rng.normal(0.0, 2.0, 3)), rng.uniform(-2.0, 2.0, 3)) for _ in range(2)
     )
+    depth = rng.uniform(-1.0, 3.0)
+    point = (base * FRONT.placement).act(depth * np.array([*rng.uniform(-1.0, 1.0, 2), -1.0]))
+    term = vkc.keep_in_view(scene, FRONT, point, margin=0.0, nearest=0.0, until=0.0)
+    (traced,) = trace_terms(scene, [term])
     inputs = [np.concatenate([one.rotation.T.ravel(), one.translation]) for one in (base, tool)]
     frames = dict(zip((FRONT.find_frame(scene.robot), scene.robot.tool_frame), inputs, strict=True))
     now = np.concatenate([frames[name] for name in traced.formula.frames])

@@ -103,10 +103,7 @@ class Room:
         """
         clouds = []
         for label, shapes in self._clouds.items():
-            placed = []
-            for shape in shapes:
-                rotation = shape.placement.rotation
-                placed.append(shape.geometry.points @ rotation.T + shape.placement.translation)
+            placed = [shape.geometry.place(shape.placement) for shape in shapes]
             points = select_for_drawing(np.concatenate(placed), _MAX_DRAWN_POINTS)
             colour = tuple(float(value) for value in shapes[0].meshColor[:3])
             clouds.append((label, points, float(shapes[0].geometry.radius), colour))

@@ -58,9 +58,7 @@ def draw_top_view(
         if shape.parentJoint or world.collision_labels[i] == FLOOR:
             continue
         if isinstance(shape.geometry, PointCloud):
-            clouds.append(
-                shape.placement.translation + shape.geometry.points @ shape.placement.rotation.T
-            )
+            clouds.append(shape.geometry.place(shape.placement))
             continue
         points = _place_vertices(world, i, np.eye(4), {})
         style: dict[str, Any] = {"edgecolor": "0.45", "linewidth": 0.7, "zorder": 1}

@@ -6,6 +6,7 @@ from typing import Any
 
 import coal
 import numpy as np
+import pinocchio as pin
 
 from vkc_pin.utils.arrays import Floats
 
@@ -43,6 +44,10 @@ class PointCloud(coal.Box):
 
     def __hash__(self) -> int:
         return hash((len(self.points), self.radius))
+
+    def place(self, placement: pin.SE3) -> Floats:
+        """Return the points in the world, shape (n, 3) [m], with the box's frame at `placement`."""
+        return np.asarray(self.points @ placement.rotation.T + placement.translation)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return PointCloud, (self.points, self.radius)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 from vkc_pin.execution.loop import execute
 from vkc_pin.execution.monitor import Monitor
 from vkc_pin.execution.record import Cycle, ExecutionResult
-from vkc_pin.execution.robots import IdealRobot, Robot
+from vkc_pin.execution.robots import IdealRobot, LocalisedRobot, Robot
 from vkc_pin.world.trajectory.robot_state import RobotState
 
 if TYPE_CHECKING:
@@ -15,6 +15,7 @@ __all__ = [
     "Cycle",
     "ExecutionResult",
     "IdealRobot",
+    "LocalisedRobot",
     "Monitor",
     "Robot",
     "RobotState",

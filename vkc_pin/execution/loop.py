@@ -22,6 +22,7 @@ from vkc_pin.planning.stopping import brake
 from vkc_pin.utils.arguments import check_finite_array, check_instance, check_number
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.shapes import triangulate
+from vkc_pin.world.scene.clearance_exemptions import ACCEPTED_SHORTFALL, MODEL_ERROR
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Step
 from vkc_pin.world.trajectory.trajectory import Trajectory
@@ -194,6 +195,8 @@ class _Loop:
         self._waiting: tuple[tuple[Step, ...], Trajectory] | None = None
         self._rest_since = 0.0
         self._attempts = 0  # to find a motion from rest
+        # Links that overlap where the robot stands → how deep [m]
+        self._overlaps = dict[tuple[str, str], float]()
         self._late = 0
 
     def run(self) -> ExecutionResult:
@@ -205,9 +208,14 @@ class _Loop:
             raise InputError("not at its start", field="robot", expected=expected, got=finding)
         self._rehearse()
         begin = self._robot.time + self._settings.period
-        self._robot.send(self._first.trajectory, begin)
         self._sent.append((begin, self._first))
         self._monitor = monitor
+        blocked = self._find_blockage(self._first, monitor)
+        if blocked:
+            self._brake(blocked)
+            del self._sent[0]  # the robot stays where it is
+        else:
+            self._robot.send(self._first.trajectory, begin)
         try:
             reason = self._run_cycles(begin)
         except BaseException:  # also Ctrl-C: nobody watches the robot any more
@@ -256,14 +264,22 @@ class _Loop:
         return min(max(now - begin + first, first), float(plan.trajectory.times[-1]))
 
     def _send(self, plan: Plan, begin: float) -> bool:
-        """Send a plan's motion; return whether it is not too late for that."""
+        """Send a plan's motion, unless it is too late or blocked; return whether it was sent."""
         monitor = Monitor(plan, tracking=self._settings.tracking)
-        if self._robot.time >= begin:
+        if self._find_blockage(plan, monitor) or self._robot.time >= begin:
             return False
         self._robot.send(plan.trajectory, begin)
         self._sent.append((begin, plan))
         self._monitor = monitor
         return True
+
+    def _find_blockage(self, plan: Plan, monitor: Monitor) -> str:
+        """Return what blocks a motion that has not begun, in the world as it is now; "" if nothing.
+
+        Planning takes time, in which others move on.
+        """
+        scene = None if self._settings.observe is None else self._look(plan.scene)
+        return monitor.check_world(float(plan.trajectory.times[0]), scene)[0]
 
     def _look(self, scene: Scene) -> Scene:
         """Return a scene with the present placements of objects and obstacles."""
@@ -329,38 +345,44 @@ class _Loop:
                     planner=self._settings.planner,
                 )
             except InputError as impossible:  # the steps are, there
-                return self._brake(f"{finding}; {impossible}")
+                return self._brake(f"{finding}; {impossible}", error=error)
             if found.success and self._send(found, now + self._settings.lead):
                 return "replan", finding
-            finding = f"{finding}; {'too late' if found.success else found.status}"
-        return self._brake(finding)
+            too_late = "too late, or blocked meanwhile"
+            finding = f"{finding}; {too_late if found.success else found.status}"
+        return self._brake(finding, error=error)
 
     def _make_stop(self, motion_time: float) -> Trajectory:
         """Return the motion that brakes from a time of the present motion on [s]."""
         plan = self._plan
         return brake(plan.scene, plan.trajectory, motion_time, plan.options)
 
-    def _brake(self, reason: str, *, pulls: bool = False) -> tuple[Decision, str]:
+    def _brake(
+        self, reason: str, *, error: Floats | None = None, pulls: bool = False
+    ) -> tuple[Decision, str]:
         """Send a braking motion on the path.
 
         Whatever will be touched, nothing is better than to brake: it is sent unchecked.
 
         Args:
             reason: Why.
+            error: Distance of the robot from its motion, shape (n,), if that is why: it brakes at
+                this distance from the path.
             pulls: Whether the hand pulls against the mechanism that it holds. To brake on the path
                 would be to pull on: the robot brakes where it really goes.
         """
         if pulls and self._robot.time < self._sent[-1][0] and len(self._sent) > 1:
             self._sent.pop()  # a motion that has not begun, and never will
         plan = self._plan
-        error = np.zeros(plan.trajectory.robot_size)
-        error_rate = np.zeros(plan.trajectory.robot_size)
+        size = plan.trajectory.robot_size
+        error = np.zeros(size) if error is None else error
+        error_rate = np.zeros(size)
         measured = 0.0
         if pulls:
             state = self._robot.read()
             measured = self._get_motion_time(state.time)
-            error = state.positions - plan.trajectory.at(measured)[: len(error)]
-            error_rate = state.velocities - plan.trajectory.velocity(measured)[: len(error)]
+            error = state.positions - plan.trajectory.at(measured)[:size]
+            error_rate = state.velocities - plan.trajectory.velocity(measured)[:size]
         delay = _BRAKE_DELAY
         while True:
             begin = self._robot.time + delay
@@ -422,9 +444,12 @@ class _Loop:
             scene = self._look(self._plan.scene_at(end))
             if self._joint is not None:
                 scene = self._joint.update(scene)
-            if self._pull:
-                positions = self._robot.read().positions
+            positions = self._robot.read().positions
+            distance = float(np.abs(positions - scene.start).max())
+            if self._pull or distance > self._settings.tracking:
                 scene = scene.with_start(base=positions[:3], arm=positions[3:])
+            for links, depth in self._overlaps.items():
+                scene = scene.with_allowed(*links, -depth)
             scene = measure_grasps(scene)
             prepared = prepare(
                 scene,
@@ -443,10 +468,12 @@ class _Loop:
         )
         self._attempts += 1
         if not found.success:
+            self._overlaps = _find_small_overlaps(found)
             return "wait", found.status
         if not self._send(found, self._robot.time + self._settings.period):
-            return "wait", "too late"
+            return "wait", "too late, or blocked meanwhile"
         self._waiting = None
+        self._overlaps = {}
         self._joint = None  # the new motion accounts for it
         if self._pull:
             self._pull = ""
@@ -462,3 +489,20 @@ class _Loop:
             return False
         moved = np.abs(self._robot.read().positions - self._pulled_to)
         return bool(moved.max() > self._settings.tracking)
+
+
+def _find_small_overlaps(failed: Plan) -> dict[tuple[str, str], float]:
+    """Return the links that overlap at the start of a failed plan → depth to allow [m].
+
+    What is seen while the robot brakes may be a little where the hand already is. Where anything
+    overlaps deeper than by an error of the model, nothing is allowed.
+    """
+    overlaps = dict[tuple[str, str], float]()
+    for violation in failed.report.violations:
+        if violation.constraint != "start":
+            continue
+        first, dash, second = violation.subject.partition(" – ")
+        if not dash or violation.amount > MODEL_ERROR:
+            return {}
+        overlaps[first, second] = violation.amount + ACCEPTED_SHORTFALL
+    return overlaps

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from vkc_pin.errors import InputError
-from vkc_pin.utils.arguments import check_instance, check_number
+from vkc_pin.errors import InputError, format_value
+from vkc_pin.utils.arguments import check_finite_array, check_instance, check_number
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.frames import invert_frame, place_base, place_motion, turn_base
 from vkc_pin.world.trajectory.robot_state import RobotState as RobotState
+from vkc_pin.world.trajectory.splicing import extract_times
 from vkc_pin.world.trajectory.trajectory import Trajectory
+
+_SENDING_TIME = 0.01  # [s] to send a motion, until it begins
 
 
 @runtime_checkable
@@ -104,3 +112,94 @@ class IdealRobot:
             self._clock = max(self._clock, until)
         else:
             time.sleep(max(until - self.time, 0.0))
+
+
+class LocalisedRobot:
+    """A robot that drives by its odometry, and is localised in the scene meanwhile.
+
+    States are read in the frame of the scene, and motions are sent in that of the odometry, as it
+    lies in the scene when they are sent. Small corrections of the localisation are followed: what
+    is left of the motion is sent again. After larger ones the robot is off its motion, and
+    `execute` plans again from where it is, if its `tracking` is no larger than `step`.
+
+    In terms of ROS (REP 105), the scene is "map", and the odometry's frame "odom".
+
+    Args:
+        robot: The robot, whose states and motions are in the frame of its odometry.
+        locate: Returns the frame of the odometry in the scene, as the localisation has it now: x, y
+            [m], yaw [rad].
+        step: Largest correction that is followed, of the base's x and y [m] and its yaw [rad].
+
+    Raises:
+        InputError: `robot` lacks a method of `Robot`, `locate` is no function, or `step` is
+            negative. Later: `locate` returns something else than three numbers.
+    """
+
+    def __init__(
+        self, robot: Robot, locate: Callable[[], ArrayLike], *, step: float = 0.005
+    ) -> None:
+        if not isinstance(robot, Robot):
+            expected = "an object with the methods of `Robot`"
+            raise InputError("no robot", field="robot", expected=expected, got=format_value(robot))
+        if not callable(locate):
+            expected, got = "a function without arguments", format_value(locate)
+            raise InputError("cannot be called", field="locate", expected=expected, got=got)
+        self._robot = robot
+        self._locate = locate
+        self._step = check_number(step, "step", "a distance [m], [rad]", low=0.0)
+        self._sent: tuple[float, Trajectory, Floats] | None = None  # begin, motion, frame
+
+    @property
+    def time(self) -> float:
+        """Time of the robot's clock [s]."""
+        return self._robot.time
+
+    def read(self) -> RobotState:
+        """Return the state as it was measured last, in the scene."""
+        state = self._robot.read()
+        frame = self._read_frame()
+        return replace(
+            state,
+            positions=place_base(frame, state.positions),
+            velocities=turn_base(frame[2], state.velocities),
+        )
+
+    def send(self, motion: Trajectory, begin: float) -> None:
+        """Execute a motion in the scene from a time on; see `Robot.send`."""
+        check_instance(motion, Trajectory, "motion")
+        frame = self._read_frame()
+        self._robot.send(place_motion(invert_frame(frame), motion), begin)
+        self._sent = begin, motion, frame
+
+    def stop(self) -> None:
+        """Come to rest at once, as the robot itself does it."""
+        self._sent = None
+        self._robot.stop()
+
+    def wait(self, until: float) -> None:
+        """Return at a time, at once if it is over; follow corrections of the localisation."""
+        self._robot.wait(until)
+        if self._sent is not None:
+            self._follow(*self._sent)
+
+    def _follow(self, begin: float, motion: Trajectory, sent: Floats) -> None:
+        """Send what is left of a motion again, if the odometry's frame is not where it was."""
+        frame = self._read_frame()
+        now = self._robot.time
+        first, last = motion.times[[0, -1]].tolist()
+        at = first + now + _SENDING_TIME - begin
+        if not first < at < last - _SENDING_TIME:
+            return  # a motion that has not begun follows the one before it
+        base = motion.at(at)[:3]
+        correction = place_base(frame, place_base(invert_frame(sent), base)) - base
+        if 0.0 < np.abs(correction).max() <= self._step:
+            self.send(extract_times(motion, at, last), now + _SENDING_TIME)
+            self._sent = begin, motion, frame
+
+    def _read_frame(self) -> Floats:
+        """Return the frame of the odometry in the scene now: x, y [m], yaw [rad]."""
+        frame = check_finite_array(self._locate(), "locate()")
+        if frame.shape != (3,):
+            expected, got = "x, y [m], yaw [rad]", format_value(frame.tolist())
+            raise InputError("wrong shape", field="locate()", expected=expected, got=got)
+        return frame

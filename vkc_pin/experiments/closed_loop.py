@@ -17,12 +17,14 @@ import pinocchio as pin
 from vkc_pin.errors import InputError
 from vkc_pin.execution.loop import execute
 from vkc_pin.execution.record import ExecutionResult
+from vkc_pin.execution.robots import LocalisedRobot, Robot
 from vkc_pin.experiments.harness import runner
 from vkc_pin.experiments.harness.record import Record, trial, values
 from vkc_pin.experiments.harness.runner import LIMITS, Execution, describe_limit
 from vkc_pin.experiments.harness.tables import count, format_table, join_sections, select
 from vkc_pin.experiments.tasks import TASKS as ALL
 from vkc_pin.experiments.tasks import make_start
+from vkc_pin.options import Options
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.prepare import plan
 from vkc_pin.simulation.physics import import_mujoco
@@ -33,6 +35,7 @@ from vkc_pin.world.scene.estimated_joints import find_axis
 from vkc_pin.world.scene.joint_estimation import JointEstimate
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Actuate, Place, Step
+from vkc_pin.world.trajectory.frames import invert_frame, place_base
 
 TASKS = (
     "door",
@@ -49,7 +52,9 @@ ROWS: Mapping[str, str] = {
     "displaced": "the object is up to 50 mm and 5° elsewhere, which is noticed at 1 m",
     "obstacle": "an obstacle appears on the path, 1.5 m ahead of the base, with a motion round it",
     "person": "a person crosses the path of the base at 0.5 to 1 m/s, and is given 0.3 m of room",
-    "localisation": "the base is localised 20 mm and 1° off, and drifts by 5 mm/m and 0.2°/m",
+    "localisation": "the base is localised 20 mm and 1° off, and drifts by 5 mm/m and 0.2°/m, "
+    "unless the hand is within 1 m of its grasp, or of where its motion ends; plans keep 30 mm of "
+    "clearance",
     "grasp": "the hand closes up to 8 mm and 3° off, which is noticed then",
     "axis": "the hinge's axis or slide's direction is up to 30 mm and 5° elsewhere, the handle is "
     "not; a camera sees the grasped link with 1 mm and 0.3° of noise",
@@ -78,9 +83,13 @@ _LINK_NOISE = (0.001, float(np.radians(0.3)))  # of a camera: position [m] and r
 # Limits of a pull: a third of the load that breaks a grasp, three times that of an undisturbed one
 _FORCE_LIMIT = 93.0  # [N]
 _TORQUE_LIMIT = 10.0  # [N·m]
+_TRACKING = 0.008  # [m], [rad]; twice what the servos are off undisturbed
+_CLEARANCE = Options().dist_safe  # [m]
+_UNCERTAIN_CLEARANCE = 0.03  # [m], that starts have
+_UPDATE = 0.05  # [m] of travel between two corrections of the localisation
 
 
-Observation = Callable[[Scene, float, Floats, float], Scene]
+Observation = Callable[[Scene, SimulatedRobot], Scene]
 
 
 @dataclass(frozen=True)
@@ -89,10 +98,10 @@ class Disturbance:
 
     Attributes:
         actual: The scene as it really is, at the start.
-        observe: Updates a scene as the robot sees the world: (scene, robot's clock [s], measured
-            configuration, path length of the base so far [m]) → scene.
+        observe: Updates a scene as the robot sees the world: (scene, robot) → scene.
         obstacle: Time [s] → centre of the moving obstacle, shape (3,); None without one.
         offset, drift: See `SimulatedRobot`.
+        landmarks: Places, shape (3,) each, near which the robot sees where it is.
     """
 
     actual: Scene
@@ -100,6 +109,7 @@ class Disturbance:
     obstacle: Callable[[float], Floats] | None = None
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     drift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    landmarks: tuple[Floats, ...] = ()
 
 
 def run(
@@ -207,7 +217,8 @@ def _record(spec: dict[str, Any]) -> dict[str, Any]:
     rng = np.random.default_rng([seed, list(ROWS).index(row), spec["number"]])
     radius = _ROOM if row == "person" else _WIDTH
     start = _add_person(make_start(spec["task"], seed, spec["number"]), radius)
-    found = plan(start, ALL[spec["task"]].steps, seed=seed, **LIMITS)
+    keeps = Options(dist_safe=_UNCERTAIN_CLEARANCE if row == "localisation" else _CLEARANCE)
+    found = plan(start, ALL[spec["task"]].steps, options=keeps, seed=seed, **LIMITS)
     fields: dict[str, Any] = {"row": row, "task": spec["task"], "number": spec["number"]}
     if not found.success:
         return trial(found, method="VKC", seed=seed, **fields)
@@ -220,9 +231,7 @@ def _record(spec: dict[str, Any]) -> dict[str, Any]:
     robot = _make_robot(found, disturbance, spec)
 
     def observe(scene: Scene) -> Scene:
-        base = robot.rows[:, :2]
-        travelled = float(np.linalg.norm(np.diff(base, axis=0), axis=1).sum())
-        return disturbance.observe(scene, robot.time, robot.read().positions, travelled)
+        return disturbance.observe(scene, robot)
 
     options: dict[str, Any] = {}
     if row == "axis":
@@ -232,7 +241,12 @@ def _record(spec: dict[str, Any]) -> dict[str, Any]:
             "force_limit": _FORCE_LIMIT,
             "torque_limit": _TORQUE_LIMIT,
         }
-    result = execute(found, robot, observe=observe, **options)
+    driver: Robot = robot
+    if row == "localisation":
+        localise = _make_localisation(robot, found, disturbance)
+        driver = LocalisedRobot(robot, localise, step=_TRACKING)
+        options = {"tracking": _TRACKING}
+    result = execute(found, driver, observe=observe, **options)
     robot.wait(robot.time + 1.0)
     fields |= _judge("closed", found, robot, disturbance, result)
     fields |= {
@@ -280,14 +294,12 @@ def _disturb(row: str, found: Plan, rng: np.random.Generator) -> Disturbance:
         largest, turn = (0.05, 5.0) if row == "displaced" else (0.008, 3.0)
         about = at_grasp if row == "grasp" else scene.objects[name].placement.translation
         actual = _displace(scene, name, largest, np.radians(turn), about, rng)
-        placement = actual.objects[name].placement
 
-        def see(known: Scene, clock: float, measured: Floats, travelled: float) -> Scene:
-            is_seen = _is_near(scene, measured, at_grasp)
+        def see(known: Scene, robot: SimulatedRobot) -> Scene:
+            is_seen = _is_near(scene, robot.read().positions, at_grasp)
             if row == "grasp":
-                is_seen = clock > closing + found.options.grasp_time
-            is_free = name not in known.held or not known.objects[name].object.free
-            return known.with_placement(name, placement) if is_seen and is_free else known
+                is_seen = robot.time > closing + found.options.grasp_time
+            return _see_object(known, name, robot) if is_seen else known
 
         return Disturbance(actual, see)
     if row == "localisation":
@@ -295,12 +307,26 @@ def _disturb(row: str, found: Plan, rng: np.random.Generator) -> Disturbance:
         signs = rng.choice([-1.0, 1.0], 2)
         offset = (0.02 * np.cos(angle), 0.02 * np.sin(angle), np.radians(1.0) * signs[0])
         drift = (0.005 * np.cos(angle), 0.005 * np.sin(angle), np.radians(0.2) * signs[1])
-        return _mislocalise(found, name, offset, drift, at_grasp)
+        at_end = found.pose(None, float(found.trajectory.times[-1])).translation
+
+        def look(known: Scene, robot: SimulatedRobot) -> Scene:
+            is_seen = _is_near(scene, robot.read().positions, at_grasp)
+            return _see_object(known, name, robot) if is_seen else known
+
+        landmarks = (at_grasp, at_end)
+        return Disturbance(scene, look, offset=offset, drift=drift, landmarks=landmarks)
     if row == "axis":
         return Disturbance(_choose_axis(scene, step, rng), lambda known, *_: known)
     if row == "nothing":
         return Disturbance(scene, lambda known, *_: known)
     return _obstruct(row, found, closing, rng)
+
+
+def _see_object(known: Scene, name: str, robot: SimulatedRobot) -> Scene:
+    """Return a scene in which an object is where it really is, unless the hand carries it."""
+    if name in known.held and known.objects[name].object.free:
+        return known
+    return known.with_placement(name, robot.object_states()[name].placement)
 
 
 def _is_near(scene: Scene, measured: Floats, place: Floats) -> bool:
@@ -385,33 +411,28 @@ def _make_camera(
     return see
 
 
-def _mislocalise(
-    found: Plan,
-    name: str,
-    offset: tuple[float, float, float],
-    drift: tuple[float, float, float],
-    at_grasp: Floats,
-) -> Disturbance:
-    """Return a bias of the base's localisation.
+def _make_localisation(
+    robot: SimulatedRobot, found: Plan, disturbance: Disturbance
+) -> Callable[[], Floats]:
+    """Return a function that localises a robot near landmarks, whenever it has moved on a little.
 
-    A camera sees the object where it is relative to the robot, which believes to be at q + b when
-    it is at q: in its frame, the object is moved by the bias b.
+    The robot believes to be at q + b when it is at q. The odometry's frame is corrected by the bias
+    b at this time, and stays as it is until the next correction.
     """
-    at = found.scene.objects[name].placement
+    frame = np.zeros(3)
+    place = robot.read().positions[:2]  # of the last correction
 
-    def see(known: Scene, clock: float, measured: Floats, travelled: float) -> Scene:
-        is_free = name not in known.held or not known.objects[name].object.free
-        if not (is_free and _is_near(found.scene, measured, at_grasp)):
-            return known
+    def locate() -> Floats:
+        measured = robot.read().positions
         base = measured[:3]
-        bias = np.array(offset) + np.array(drift) * travelled
-        turn = pin.SE3(pin.utils.rotate("z", bias[2]), np.zeros(3))
-        about = pin.SE3(np.eye(3), np.array([base[0] - bias[0], base[1] - bias[1], 0.0]))
-        shift = pin.SE3(np.eye(3), np.array([bias[0], bias[1], 0.0]))
-        moved = shift * about * turn * about.inverse()
-        return known.with_placement(name, moved * at)
+        seen = place_base(frame, measured)
+        is_near = any(_is_near(found.scene, seen, mark) for mark in disturbance.landmarks)
+        if is_near and np.linalg.norm(base[:2] - place) > _UPDATE:
+            place[:] = base[:2]
+            frame[:] = place_base(base - robot.bias, invert_frame(base))
+        return frame.copy()
 
-    return Disturbance(found.scene, see, offset=offset, drift=drift)
+    return locate
 
 
 def _obstruct(row: str, found: Plan, closing: float, rng: np.random.Generator) -> Disturbance:
@@ -464,8 +485,8 @@ def _appear(found: Plan, closing: float, rng: np.random.Generator) -> Disturbanc
 
 
 def _see_obstacle(obstacle: Callable[[float], Floats]) -> Observation:
-    def see(known: Scene, clock: float, measured: Floats, travelled: float) -> Scene:
-        return known.with_obstacle(_PERSON, [*obstacle(clock), 0.0, 0.0, 0.0])
+    def see(known: Scene, robot: SimulatedRobot) -> Scene:
+        return known.with_obstacle(_PERSON, [*obstacle(robot.time), 0.0, 0.0, 0.0])
 
     return see
 
@@ -483,13 +504,14 @@ def _judge(
         reasons.append(result.reason)
     reasons += _find_misses(found, robot)
     reasons += [grip.problem for grip in robot.grips if grip.problem]
-    depth = 0.0
     contacts = robot.contacts(disturbance.actual)
-    depth = max([depth, *(contact.depth for contact in contacts)])
+    depth = max((contact.depth for contact in contacts), default=0.0)
+    reasons += [str(contact) for contact in contacts if contact.depth > _DEEPEST]
     if disturbance.obstacle is not None:
-        depth = max(depth, _measure_depth(found.scene, robot, disturbance.obstacle))
-    if depth > _DEEPEST:
-        reasons.append(f"collides by {1e3 * depth:.1f} mm")
+        overlap = _measure_depth(found.scene, robot, disturbance.obstacle)
+        depth = max(depth, overlap)
+        if overlap > _DEEPEST:
+            reasons.append(f"overlaps the {_PERSON} by {1e3 * overlap:.1f} mm")
     return {
         loop: not reasons,
         f"{loop}_reason": "; ".join(reasons),

@@ -43,10 +43,11 @@ _NOSLIP_ITERATIONS = 5
 # inaccurate that before MuJoCo 3.13 a stick that rests on two discs rolls by 0.2 rad in 6 s; with
 # this, by 10 µrad.
 _DISTANCE_TOLERANCE = 1e-12
-# Impedance of welds, the largest that MuJoCo accepts. With the default, 0.9 to 0.95, a stick of
-# 0.4 kg turns by 3 mrad in the hand under its weight, and more the thinner it is; with this, by
-# 6 µrad.
-_WELD_IMPEDANCE = 0.9999
+# Impedances of constraints: the largest that MuJoCo accepts, and the stablest of soft ones
+_MAX_IMPEDANCE = 0.9999
+_SOFT_IMPEDANCE = 0.5
+# Index of the factor of rotations in `eq_data` of a weld
+TORQUE_SCALE = 10
 # Elements xx, yy, zz, xy, xz, yz of a matrix, MuJoCo's order of a full inertia.
 _INERTIA_ELEMENTS = ([0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2])
 # MuJoCo draws groups 0 to 2; collision shapes are hidden.
@@ -167,6 +168,8 @@ class Builder:
             model = self.spec.compile()
         except ValueError as error:
             raise InputError("MuJoCo rejects the scene", field="scene", got=str(error)) from error
+        for number in range(len(holds)):
+            self._set_stiffness(model, number)
         return self._make_world(model)
 
     def _set_options(self) -> None:
@@ -364,9 +367,33 @@ class Builder:
         )
         weld.name1 = holder.name
         weld.name2 = held.name
-        weld.data[10] = 1.0
-        weld.solref = [2.0 * self.physics.timestep, 1.0]  # as stiff as the integrator allows
-        weld.solimp[:2] = _WELD_IMPEDANCE
+
+    def _set_stiffness(self, model: Any, number: int) -> None:
+        """Set the stiffness of a weld, in a compiled model.
+
+        MuJoCo's constraint of a deviation r has the impedance d and the regularization
+        R = (1 - d) / d · a, where a is the sum of the bodies' inverse weights. At rest its force is
+        k r / R, with k = 1 / (d T)² for the time constant T. Therefore d (1 - d) = 1 / (K a T²)
+        for the stiffness K. If even d = 1/2 is too stiff, T is longer. Rotations are r = s θ / 2
+        with a factor s; their torque about the angle θ is s / 2 times the force.
+
+        Source: MuJoCo's documentation, "Computation", section "Constraint model: Parameters".
+        """
+        stiffness = self.physics.grasp_stiffness
+        turning_stiffness = self.physics.grasp_turning_stiffness
+        bodies = [int(model.eq_obj1id[number]), int(model.eq_obj2id[number])]
+        shift, turn = np.asarray(model.body_invweight0)[bodies].sum(axis=0).tolist()
+        time_constant = 2.0 * self.physics.timestep  # the shortest that the integrator allows
+        softness = 1.0 / (stiffness * shift * time_constant**2)
+        impedance = _SOFT_IMPEDANCE
+        if softness < _SOFT_IMPEDANCE * (1.0 - _SOFT_IMPEDANCE):
+            impedance = min(0.5 + np.sqrt(0.25 - softness), _MAX_IMPEDANCE)
+        else:
+            time_constant = 2.0 / np.sqrt(stiffness * shift)
+        model.eq_solref[number] = time_constant, 1.0
+        model.eq_solimp[number, :2] = impedance
+        ratio = turning_stiffness * turn / (stiffness * shift)
+        model.eq_data[number, TORQUE_SCALE] = 2.0 * np.sqrt(ratio)
 
     def _add_carrier(self, hold: Hold, link: Any, place: pin.SE3) -> Any:
         """Add an intermediate body whose joints are the degrees of freedom of a grasp."""
@@ -390,8 +417,9 @@ class Builder:
             if np.isfinite([freedom.lower, freedom.upper]).all():
                 joint.limited = self.mj.mjtLimited.mjLIMITED_TRUE
                 joint.range = freedom.lower, freedom.upper
-                joint.solref_limit = [2.0 * self.physics.timestep, 1.0]  # as stiff as the weld
-                joint.solimp_limit[:2] = _WELD_IMPEDANCE
+                # as stiff as the integrator allows
+                joint.solref_limit = [2.0 * self.physics.timestep, 1.0]
+                joint.solimp_limit[:2] = _MAX_IMPEDANCE
             joints.append(joint.name)
         return body
 

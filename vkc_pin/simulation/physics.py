@@ -38,6 +38,8 @@ _RANGES = {
     "rolling_friction": (0.0, 1.0),
     "grasp_force": (1e-6, 1e9),
     "grasp_torque": (1e-6, 1e9),
+    "grasp_stiffness": (1.0, 1e9),
+    "grasp_turning_stiffness": (0.1, 1e9),
     "closing_force": (1e-6, 1e6),
     "grip_time": (1e-3, 60.0),
     "latch_play": (0.0, 10.0),
@@ -68,6 +70,9 @@ class Physics:
         grasp_force: Force, averaged over 20 ms, above which a hand loses its hold [N]. A parallel
             gripper that closes with 235 N holds 2 · 0.6 · 235 N by its rubber pads.
         grasp_torque: Torque, averaged over 20 ms, above which a hand loses its hold [N·m].
+        grasp_stiffness: Stiffness of a hand against displacements of what it holds [N/m].
+        grasp_turning_stiffness: Stiffness against rotations [N·m/rad]. The default is that of a
+            strain wave gear of a wrist; fingers with rubber pads yield more.
         closing_force: Force of each finger in grasps by friction [N]; a lower effort limit in the
             URDF takes precedence.
         grip_time: Time that fingers take to close or open in grasps by friction [s].
@@ -92,6 +97,8 @@ class Physics:
     rolling_friction: float = 1e-3
     grasp_force: float = 280.0
     grasp_torque: float = 30.0
+    grasp_stiffness: float = 1e6
+    grasp_turning_stiffness: float = 1e4
     closing_force: float = 235.0
     grip_time: float = 0.6
     balanced: bool = True

@@ -267,6 +267,11 @@ class SimulatedRobot:
         return self._recording.list_grasp_forces()
 
     @property
+    def bias(self) -> Floats:
+        """Bias of the base's localisation now: x, y [m], yaw [rad], shape (3,)."""
+        return self._offset + self._drift * self._travelled
+
+    @property
     def grips(self) -> tuple[Grip, ...]:
         """Grasps so far and their largest loads."""
         return tuple(self._stepper.grips.grips)
@@ -444,7 +449,7 @@ class SimulatedRobot:
         before = stepper.positions
         self._errors.append(target - before)
         # The base's controller knows the measured position only.
-        command[:_BASE_SIZE] -= self._bias
+        command[:_BASE_SIZE] -= self.bias
         stepper.command(command)
         is_stable = stepper.step()
         self._forces.append(stepper.forces)
@@ -457,15 +462,10 @@ class SimulatedRobot:
         self._travelled += float(np.hypot(*moved))
         self._measure()
 
-    @property
-    def _bias(self) -> Floats:
-        """Bias of the base's localisation: x, y [m], yaw [rad]."""
-        return self._offset + self._drift * self._travelled
-
     def _measured_positions(self) -> Floats:
         """Return the positions of base and arm as measured, without noise, shape (n,)."""
         positions = self._stepper.positions[: self._size]
-        positions[:_BASE_SIZE] += self._bias
+        positions[:_BASE_SIZE] += self.bias
         return positions
 
     def _measure(self) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.simulation.contacts import Pairs
-from vkc_pin.simulation.model import PhysicalWorld, to_mujoco_quaternion
+from vkc_pin.simulation.model import TORQUE_SCALE, PhysicalWorld, to_mujoco_quaternion
 from vkc_pin.simulation.physics import Physics, import_mujoco
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.scene.hold import (
@@ -32,8 +32,6 @@ _AVERAGING_TIME = 0.02
 _LATCH_TOLERANCE = 2e-3
 Span = tuple[Hold, float, float]
 """A hold with its begin and end [s]."""
-# Rotational rows of a weld act on half angles, as quaternions do.
-_WELD_SCALES = (1.0, 1.0, 1.0, 0.5, 0.5, 0.5)
 
 
 @dataclass(frozen=True)
@@ -265,7 +263,8 @@ class Grips:
         """
         count = len(other.holds)
         model = self.physical.model
-        model.eq_data[:count] = other.physical.model.eq_data[:count]
+        placements = slice(0, TORQUE_SCALE)
+        model.eq_data[:count, placements] = other.physical.model.eq_data[:count, placements]
         data.eq_active[:count] = other_data.eq_active[:count]
         self.grips = other.grips
         self._active = other._active
@@ -305,9 +304,13 @@ class Grips:
         is_equality = np.asarray(data.efc_type) == self._equality
         owners = np.asarray(data.efc_id)
         for hold, (number, _) in list(self._active.items()):
-            rows = np.flatnonzero(is_equality & (owners == self.holds.index(hold)))
+            index = self.holds.index(hold)
+            rows = np.flatnonzero(is_equality & (owners == index))
+            load = np.array(data.efc_force)[rows]
+            # Rotational rows act on scaled half angles, as quaternions do.
+            load[3:] *= 0.5 * self.physical.model.eq_data[index, TORQUE_SCALE]
             forces = self._forces[hold]
-            forces.append(np.asarray(data.efc_force)[rows] * _WELD_SCALES)
+            forces.append(load)
             if len(forces) < self._window:
                 continue
             mean = np.mean(forces, axis=0)

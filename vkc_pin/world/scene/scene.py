@@ -20,6 +20,7 @@ from vkc_pin.utils.arguments import (
     check_choice,
     check_instance,
     check_mapping,
+    check_number,
     is_number,
 )
 from vkc_pin.utils.arrays import Floats
@@ -378,6 +379,27 @@ class Scene:
         pose = as_placement(placement, name="placement")
         # Results in `memory` depend on the obstacles: the copy begins with none.
         return dataclasses.replace(self, **move_obstacle(vars(self), name, pose))
+
+    def with_allowed(self, first: str, second: str, margin: float) -> Scene:
+        """Return the scene in which two links keep a margin of their own from each other.
+
+        Robot, objects and obstacles are shared with this scene. Of several margins for one pair the
+        smallest counts.
+
+        Args:
+            first: A link of the robot, "<object>.<link>", or an obstacle.
+            second: Another one.
+            margin: Distance that they keep instead of `dist_safe` [m]; negative: how deep they may
+                overlap.
+
+        Raises:
+            UnknownNameError: There is no such link or obstacle.
+            InputError: `margin` is not a number.
+        """
+        from vkc_pin.world.scene.scene_file import allow_pair
+
+        margin = check_number(margin, "margin", "a distance [m]")
+        return dataclasses.replace(self, **allow_pair(vars(self), (first, second), margin))
 
     def with_map(
         self,

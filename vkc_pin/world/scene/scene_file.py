@@ -14,6 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from vkc_pin.errors import UnknownNameError, find_nearest_name
+from vkc_pin.utils.arguments import check_choice
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.pickling import freeze
 from vkc_pin.world.files.documents import Document, parse_document
@@ -178,6 +179,31 @@ def add_points(
         floor_labels = [FLOOR] * len(floor_shapes)
         changed[labels_key] = (*kept_labels, *[name] * len(added), *floor_labels)
     return changed
+
+
+def allow_pair(fields: Mapping[str, Any], pair: tuple[str, str], margin: float) -> dict[str, Any]:
+    """Return the attributes of a scene that change when two links may be close, by name.
+
+    Args:
+        fields: Attributes of a `Scene`, by name.
+        pair: Labels of the links.
+        margin: Distance that they keep [m].
+
+    Raises:
+        UnknownNameError: There is no such link.
+    """
+    described = fields["described"]
+    labels, _ = _list_labels(described, fields["robot"], fields["objects"])
+    for name, argument in zip(pair, ("first", "second"), strict=True):
+        links = [label for label in labels if labels[label] == [label]]
+        check_choice(name, links, "link", argument)
+    key = frozenset(pair)
+    least = min(margin, fields["allowed"].get(key, np.inf))
+    item = schema.AllowSchema(pair=pair, margin=least)
+    return {
+        "allowed": freeze({**fields["allowed"], key: least}),
+        "described": described.model_copy(update={"allow": (*described.allow, item)}),
+    }
 
 
 def make_document(fields: Mapping[str, Any]) -> dict[str, Any]:

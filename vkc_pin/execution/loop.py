@@ -195,6 +195,7 @@ class _Loop:
         self._waiting: tuple[tuple[Step, ...], Trajectory] | None = None
         self._rest_since = 0.0
         self._attempts = 0  # to find a motion from rest
+        self._timeouts = 0  # of these attempts
         # Links that overlap where the robot stands → how deep [m]
         self._overlaps = dict[tuple[str, str], float]()
         self._late = 0
@@ -263,10 +264,20 @@ class _Loop:
         first = float(plan.trajectory.times[0])
         return min(max(now - begin + first, first), float(plan.trajectory.times[-1]))
 
-    def _send(self, plan: Plan, begin: float) -> bool:
-        """Send a plan's motion, unless it is too late or blocked; return whether it was sent."""
+    def _send(self, plan: Plan, begin: float | None = None) -> bool:
+        """Send a plan's motion, unless it is too late or blocked; return whether it was sent.
+
+        Args:
+            plan: The plan.
+            begin: Time of the robot's clock at which it begins [s]. Default: as soon as possible.
+        """
         monitor = Monitor(plan, tracking=self._settings.tracking)
-        if self._find_blockage(plan, monitor) or self._robot.time >= begin:
+        if self._find_blockage(plan, monitor):
+            return False
+        now = self._robot.time
+        if begin is None:
+            begin = now + self._settings.period
+        elif now >= begin:
             return False
         self._robot.send(plan.trajectory, begin)
         self._sent.append((begin, plan))
@@ -409,6 +420,7 @@ class _Loop:
         self._sent.append((begin, stop))
         self._rest_since = begin + float(motion.times[-1])
         self._attempts = 0
+        self._timeouts = 0
         if pulls:
             self._pull = reason
             self._is_released = False
@@ -460,18 +472,19 @@ class _Loop:
             )
         except InputError as impossible:
             return "wait", str(impossible)
-        # Each search is longer than the one before, with other random numbers.
+        # A search that time has ended is followed by a longer one, with other random numbers.
         first = max(self._settings.time_limit, _FIRST_SEARCH)
-        limit = min(first * 2.0**self._attempts, max(self._settings.patience, first))
+        limit = min(first * 2.0**self._timeouts, max(self._settings.patience, first))
         found = prepared.solve(
             guess=guess, time_limit=limit, seed=self._first.seed + self._attempts, explain=False
         )
         self._attempts += 1
+        self._timeouts += found.status == "time limit"
         if not found.success:
-            self._overlaps = _find_small_overlaps(found)
+            self._overlaps |= _find_small_overlaps(found)
             return "wait", found.status
-        if not self._send(found, self._robot.time + self._settings.period):
-            return "wait", "too late, or blocked meanwhile"
+        if not self._send(found):
+            return "wait", "blocked meanwhile"
         self._waiting = None
         self._overlaps = {}
         self._joint = None  # the new motion accounts for it

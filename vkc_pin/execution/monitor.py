@@ -15,7 +15,9 @@ from vkc_pin.world.scene.scene import Scene
 
 # Displacement of an object from which on the motion to it is planned again [m], [rad]: validation
 # accepts 1 mm at a grasp, and 2 mrad are 2 mm at a lever of a metre.
-_OBJECT_TOLERANCES = (1e-3, 2e-3)
+_TOLERANCES = (1e-3, 2e-3)
+# That of free objects: a hand that is off strains no mechanism, but holds them a little elsewhere
+_FREE_TOLERANCES = (3e-3, 3e-2)
 
 
 class Monitor:
@@ -74,6 +76,7 @@ class Monitor:
             displacement = placed.placement.actInv(scene.objects[name].placement)
             distance = float(np.linalg.norm(displacement.translation))
             angle = float(np.linalg.norm(pin.log3(displacement.rotation)))
-            if distance > _OBJECT_TOLERANCES[0] or angle > _OBJECT_TOLERANCES[1]:
+            most, most_angle = _FREE_TOLERANCES if placed.object.free else _TOLERANCES
+            if distance > most or angle > most_angle:
                 return name
         return ""

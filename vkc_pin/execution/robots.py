@@ -185,16 +185,23 @@ class LocalisedRobot:
     def _follow(self, begin: float, motion: Trajectory, sent: Floats) -> None:
         """Send what is left of a motion again, if the odometry's frame is not where it was."""
         frame = self._read_frame()
-        now = self._robot.time
         first, last = motion.times[[0, -1]].tolist()
-        at = first + now + _SENDING_TIME - begin
-        if not first < at < last - _SENDING_TIME:
-            return  # a motion that has not begun follows the one before it
-        base = motion.at(at)[:3]
-        correction = place_base(frame, place_base(invert_frame(sent), base)) - base
-        if 0.0 < np.abs(correction).max() <= self._step:
-            self.send(extract_times(motion, at, last), now + _SENDING_TIME)
-            self._sent = begin, motion, frame
+        delay = _SENDING_TIME
+        while True:
+            start = self._robot.time + delay
+            at = first + start - begin
+            if not first < at < last - delay:
+                return  # a motion that has not begun follows the one before it
+            base = motion.at(at)[:3]
+            correction = place_base(frame, place_base(invert_frame(sent), base)) - base
+            if not 0.0 < np.abs(correction).max() <= self._step:
+                return
+            rest = place_motion(invert_frame(frame), extract_times(motion, at, last))
+            if self._robot.time < start:
+                break
+            delay *= 2.0  # on a slow machine
+        self._robot.send(rest, start)
+        self._sent = begin, motion, frame
 
     def _read_frame(self) -> Floats:
         """Return the frame of the odometry in the scene now: x, y [m], yaw [rad]."""

@@ -272,6 +272,11 @@ class SimulatedRobot:
         return self._offset + self._drift * self._travelled
 
     @property
+    def held(self) -> frozenset[str]:
+        """Names of the objects that are grasped now."""
+        return frozenset(hold.object for hold in self._stepper.grips.loads)
+
+    @property
     def grips(self) -> tuple[Grip, ...]:
         """Grasps so far and their largest loads."""
         return tuple(self._stepper.grips.grips)

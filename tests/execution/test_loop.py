@@ -119,6 +119,63 @@ def test_robot_brakes_before_a_wall_and_gives_up() -> None:
     check_smooth(robot, result)
 
 
+def test_robot_waits_for_a_free_start() -> None:
+    """Somebody stands in the robot when it is to begin: it stays until he has left."""
+    plan = plan_door()
+    x, y = plan.scene.start[:2]
+
+    def observe(scene: vkc.Scene, time: float) -> vkc.Scene:
+        place = [x, y] if time < 2.0 else [0.95, 0.85]
+        return scene.with_obstacle("stool", [*place, 0.225, 0.0, 0.0, 0.0])
+
+    result, robot = run(observe)
+    assert result.success, result
+    times, positions = sample_motion(robot, 2.0)
+    np.testing.assert_allclose(positions, np.tile(plan.scene.start, (len(times), 1)), atol=1e-12)
+    assert {cycle.decision for cycle in result.cycles if cycle.time < 2.0} == {"wait"}
+
+
+def test_motion_that_is_blocked_meanwhile_is_not_begun() -> None:
+    """Somebody steps onto the new path while it is searched: the robot stays at rest."""
+    plan = plan_door()
+    looks = 0
+
+    def observe(scene: vkc.Scene, time: float) -> vkc.Scene:
+        nonlocal looks
+        looks += 1
+        here, ahead = plan.scene.start[:2], plan.trajectory.at(1.5)[:2]
+        # He stands in the robot, leaves when it plans, and stands before it when it has planned.
+        place = {1: here, 2: here, 4: ahead}.get(looks, (0.95, 0.85))
+        return scene.with_obstacle("stool", [*place, 0.225, 0.0, 0.0, 0.0])
+
+    result, robot = run(observe)
+    blocked = [cycle for cycle in result.cycles if cycle.reason == "blocked meanwhile"]
+    assert blocked
+    assert blocked[0].decision == "wait"
+    assert result.success, result
+    check_smooth(robot, result)
+
+
+def test_robot_leaves_what_it_touches_a_little() -> None:
+    """A measured stool overlaps the base by 3 mm where the robot stands: it goes on."""
+    plan = plan_door()
+    x, y = plan.scene.start[:2]
+
+    def observe(scene: vkc.Scene, time: float) -> vkc.Scene:
+        overlapping = scene
+        for step in range(200):
+            overlapping = scene.with_obstacle("stool", [x - 1.2 + 5e-3 * step, y, 0.225, 0, 0, 0])
+            if overlapping.start_clearance() < 0.0:
+                break
+        return overlapping
+
+    result, _ = run(observe)
+    assert result.success, result
+    assert any(cycle.reason == "infeasible" for cycle in result.cycles)
+    last = result.plans[-1][1]
+    assert any("stool" in pair for pair in last.scene.allowed)
+
+
 def test_plan_from_rest_keeps_the_terms_of_the_user() -> None:
     """Somebody stands on the path for a while: the robot brakes, and goes on later."""
     elbow = vkc.Cost("elbow", lambda s: (s.coordinate("elbow_joint") - 1.5) ** 2, weight=0.1)

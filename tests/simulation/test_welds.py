@@ -13,6 +13,8 @@ from helpers.robots import compute_placement
 
 import vkc_pin as vkc
 from vkc_pin.simulation.execution import simulate
+from vkc_pin.simulation.physics import Physics
+from vkc_pin.simulation.robot import SimulatedRobot
 from vkc_pin.simulation.welds import find_hold_spans
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.trajectory import Trajectory
@@ -97,3 +99,36 @@ def test_freedom_of_a_grasp_ends_at_its_limits(angle: float, held: bool) -> None
     assert (grip.broken is None) is held
     assert result.ok is held
     assert grip.torque < 1.0 if held else grip.torque > 20.0
+
+
+@pytest.mark.parametrize("stiffness", [(1e6, 1e4), (1e5, 500.0), (3e4, 2e4)])
+@pytest.mark.parametrize("mass", [0.2, 3.0])
+def test_hand_yields_by_its_stiffness(stiffness: tuple[float, float], mass: float) -> None:
+    """Under a force and a torque, by as much as a spring does, whatever the mass of the object."""
+    scene = replace_mass(make_grasping_scene(), "stick", mass)
+    shift_stiffness, turning_stiffness = stiffness
+    physics = Physics(grasp_stiffness=shift_stiffness, grasp_turning_stiffness=turning_stiffness)
+    robot = SimulatedRobot(scene, physics=physics, counts_planning=False)
+    stepper = robot._stepper
+    physical, data = stepper.physical, stepper.data
+
+    def measure() -> pin.SE3:
+        robot.wait(robot.time + 1.0)
+        hand = physical.place_frame(data, scene.robot.tool_frame)
+        return hand.actInv(physical.place_frame(data, "stick.stick"))
+
+    before = measure()
+    (hold,) = scene.holds
+    held = physical.model.eq_obj2id[0]
+    hand = physical.place_frame(data, scene.robot.tool_frame)
+    force, torque = np.array([0.0, 4.0, 0.0]), np.array([0.0, 0.0, 0.8])
+    lever = hand.translation - data.xipos[held]  # the wrench acts at the hand
+    data.xfrc_applied[held] = [*force, *(torque + np.cross(lever, force))]
+    after = measure()
+    turned = hand.rotation @ pin.log3(after.rotation @ before.rotation.T)
+    np.testing.assert_allclose(turned, torque / turning_stiffness, rtol=0.1, atol=2e-6)
+    shift = hand.rotation @ (after.translation - before.translation)
+    arm = hand.rotation @ before.translation
+    at_hand = shift - np.cross(turned, arm)
+    np.testing.assert_allclose(at_hand, force / shift_stiffness, rtol=0.1, atol=2e-7)
+    assert str(hold).startswith("stick.")

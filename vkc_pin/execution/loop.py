@@ -208,15 +208,16 @@ class _Loop:
             expected = "a robot at the start of the plan"
             raise InputError("not at its start", field="robot", expected=expected, got=finding)
         self._rehearse()
-        begin = self._robot.time + self._settings.period
-        self._sent.append((begin, self._first))
         self._monitor = monitor
         blocked = self._find_blockage(self._first, monitor)
+        begin = self._robot.time + self._settings.period
         if blocked:
+            self._sent.append((np.inf, self._first))  # it never begins: the robot stays there
             self._brake(blocked)
-            del self._sent[0]  # the robot stays where it is
+            del self._sent[0]
         else:
             self._robot.send(self._first.trajectory, begin)
+            self._sent.append((begin, self._first))
         try:
             reason = self._run_cycles(begin)
         except BaseException:  # also Ctrl-C: nobody watches the robot any more

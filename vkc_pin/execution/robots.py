@@ -20,6 +20,7 @@ from vkc_pin.world.trajectory.splicing import extract_times
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 _SENDING_TIME = 0.01  # [s] to send a motion, until it begins
+_ROUNDING = 1e-6  # [m], [rad] of a correction that is none
 
 
 @runtime_checkable
@@ -194,7 +195,7 @@ class LocalisedRobot:
                 return  # a motion that has not begun follows the one before it
             base = motion.at(at)[:3]
             correction = place_base(frame, place_base(invert_frame(sent), base)) - base
-            if not 0.0 < np.abs(correction).max() <= self._step:
+            if not _ROUNDING < np.abs(correction).max() <= self._step:
                 return
             rest = place_motion(invert_frame(frame), extract_times(motion, at, last))
             if self._robot.time < start:

@@ -373,9 +373,9 @@ class Builder:
 
         MuJoCo's constraint of a deviation r has the impedance d and the regularization
         R = (1 - d) / d · a, where a is the sum of the bodies' inverse weights. At rest its force is
-        k r / R, with k = 1 / (d T)² for the time constant T. Therefore d (1 - d) = 1 / (K a T²)
-        for the stiffness K. If even d = 1/2 is too stiff, T is longer. Rotations are r = s θ / 2
-        with a factor s; their torque about the angle θ is s / 2 times the force.
+        d k r / R, with k = 1 / (d T)² for the time constant T. Therefore 1 - d = 1 / (K a T²) for
+        the stiffness K. If even d = 1/2 is too stiff, T is longer. Rotations are r = s θ / 2 with a
+        factor s; their torque about the angle θ is s / 2 times the force.
 
         Source: MuJoCo's documentation, "Computation", section "Constraint model: Parameters".
         """
@@ -384,14 +384,12 @@ class Builder:
         bodies = [int(model.eq_obj1id[number]), int(model.eq_obj2id[number])]
         shift, turn = np.asarray(model.body_invweight0)[bodies].sum(axis=0).tolist()
         time_constant = 2.0 * self.physics.timestep  # the shortest that the integrator allows
-        softness = 1.0 / (stiffness * shift * time_constant**2)
-        impedance = _SOFT_IMPEDANCE
-        if softness < _SOFT_IMPEDANCE * (1.0 - _SOFT_IMPEDANCE):
-            impedance = min(0.5 + np.sqrt(0.25 - softness), _MAX_IMPEDANCE)
-        else:
-            time_constant = 2.0 / np.sqrt(stiffness * shift)
+        impedance = 1.0 - 1.0 / (stiffness * shift * time_constant**2)
+        if impedance < _SOFT_IMPEDANCE:
+            impedance = _SOFT_IMPEDANCE
+            time_constant = np.sqrt(1.0 / ((1.0 - impedance) * stiffness * shift))
         model.eq_solref[number] = time_constant, 1.0
-        model.eq_solimp[number, :2] = impedance
+        model.eq_solimp[number, :2] = min(impedance, _MAX_IMPEDANCE)
         ratio = turning_stiffness * turn / (stiffness * shift)
         model.eq_data[number, TORQUE_SCALE] = 2.0 * np.sqrt(ratio)
 

@@ -18,7 +18,7 @@ from helpers.meshes import write_wedge
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vkc_pin import Scene, load_scene
+from vkc_pin import GoTo, Scene, load_scene, plan
 from vkc_pin.world.scene.clearance_exemptions import find_clearance_exemptions
 
 HALL = """\
@@ -274,3 +274,48 @@ def test_invalid_holds_are_rejected(
 def test_invalid_holds_are_located_in_files(tmp_path: Path, held: str, message: str) -> None:
     with expect_error(rf"start\.held\.?{message}", file=tmp_path / "hall.yaml", line=2):
         load_hall(tmp_path, held)
+
+
+# --- allowed overlaps
+# ------------------------------------------------------------------------------------------------
+
+
+def test_allowed_pair_is_kept_in_the_document() -> None:
+    scene = make_hall().with_allowed("base_link", "front.panel", -0.002)
+    pair = frozenset(("base_link", "front.panel"))
+    assert scene.allowed[pair] == -0.002
+    assert scene.robot is make_hall().robot
+    again = Scene.from_document(scene.document, scene.folder)
+    assert again.allowed == scene.allowed
+    assert pair not in make_hall().allowed
+    # The smallest of several margins counts.
+    assert scene.with_allowed("front.panel", "base_link", 0.01).allowed[pair] == -0.002
+    assert scene.with_allowed("front.panel", "base_link", -0.01).allowed[pair] == -0.01
+
+
+def test_allowed_overlap_does_not_block_a_plan() -> None:
+    """A box stands 3 mm in the base."""
+    document = yaml.safe_load(HALL.replace("HELD", "{}"))
+    box = {"name": "crate", "type": "box", "size": [0.4, 0.4, 0.4], "position": [-0.7, 0.0, 0.2]}
+    document["start"]["base"] = [0.0, 0.0, 0.0]
+    document["obstacles"] = [box]
+    scene = Scene.from_document(document)
+    box["position"][0] += scene.start_clearance() + 0.003
+    scene = Scene.from_document(document)
+    assert not plan(scene, [GoTo(0.5, 0.0)]).success
+    allowed = scene.with_allowed("base_link", "crate", -0.004)
+    found = plan(allowed, [GoTo(0.5, 0.0)])
+    assert found.success, found.summary()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("base_lnk", "front.panel", 0.0), "base_link"),
+        (("base_link", "front", 0.0), "front"),
+        (("base_link", "front.panel", np.nan), "margin"),
+    ],
+)
+def test_wrong_pairs_are_named(arguments: tuple[str, str, float], message: str) -> None:
+    with expect_error(message):
+        make_hall().with_allowed(*arguments)

@@ -15,8 +15,8 @@ from vkc_pin.datasets.recipe import Recipe, get_robot_name, load_recipe, resolve
 from vkc_pin.errors import InputError, VkcError
 from vkc_pin.options import Options
 from vkc_pin.planning.initialization.keyframes import KeyframeSampler, compute_shortfall
+from vkc_pin.planning.nlp.kinematic_problem import KinematicProblem
 from vkc_pin.planning.nlp.merit import TOLERANCE
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.planner import Planner
 from vkc_pin.procedural.rooms.parts import CARRIED, Part
 from vkc_pin.procedural.rooms.random_room import Layout, RoomSettings, sample_layout
@@ -27,7 +27,7 @@ from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Actuate, Grasp, Place, Step
-from vkc_pin.world.task.terms import Term, trace_terms
+from vkc_pin.world.task.terms import Term
 
 # random configurations that inverse kinematics brings to the grasp at once
 _BATCH = 48
@@ -53,11 +53,8 @@ def find_grasping_start(
     rng: np.random.Generator,
     options: Options,
     planner: Planner,
-    terms: Sequence[Term] = (),
 ) -> Scene | None:
     """Return the scene with a random free configuration that grasps the object of a step.
-
-    The search uses the program of the step's plan.
 
     Args:
         scene: Scene.
@@ -65,7 +62,6 @@ def find_grasping_start(
         rng: Random generator.
         options: Options with clearances.
         planner: Planner whose caches are used.
-        terms: Additional terms of the program; the start may violate them.
 
     Returns:
         The scene, or None if no configuration was found.
@@ -75,13 +71,8 @@ def find_grasping_start(
     # Wherever the hand is: the chain does not depend on it.
     holding = scene.with_held({name: attachment})
     with planner.acquire() as cache:
-        problem = TrajectoryProblem(
-            holding,
-            compile_task(holding, [step], options),
-            options,
-            trace_terms(scene, terms),
-            cache=cache,
-        )
+        task = compile_task(holding, [step], options)
+        problem = KinematicProblem(holding, task, options, cache=cache)
         chain = problem.chain
         coordinates = scene.objects[name].object.attachments[attachment].coordinates
         freedoms = [chain.index(f"{name}.{coordinate}") for coordinate in coordinates]
@@ -93,7 +84,7 @@ def find_grasping_start(
 
 
 def _sample_grasping_configuration(
-    problem: TrajectoryProblem, freedoms: Sequence[int], rng: np.random.Generator
+    problem: KinematicProblem, freedoms: Sequence[int], rng: np.random.Generator
 ) -> Floats | None:
     """Sample a free configuration of a chain at the pose of its first phase, shape (n,).
 
@@ -101,7 +92,7 @@ def _sample_grasping_configuration(
     grasp's freedoms.
 
     Args:
-        problem: Program of the task.
+        problem: The task.
         freedoms: Coordinates of the grasp's freedoms.
         rng: Random generator.
 
@@ -331,8 +322,7 @@ def _sample_open_task(
     if not given:
         start = _sample_start(recipe, place, rng, scene.objects[name].placement.translation)
         return start, (step,)
-    terms = resolve_terms(recipe.select_terms("given-open"), scene, name, attachment)
-    grasping = find_grasping_start(scene, step, rng, recipe.options, planner, terms)
+    grasping = find_grasping_start(scene, step, rng, recipe.options, planner)
     if grasping is None:
         raise NoProblemError(f"no free grasp of {name}.{attachment} in {scene.name} was found")
     return grasping, (step,)

@@ -28,7 +28,7 @@ from vkc_pin.experiments.tasks import TASKS as ALL
 from vkc_pin.experiments.tasks import make_start
 from vkc_pin.options import Options
 from vkc_pin.planning.initialization.keyframes import KeyframeSampler
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.planning.nlp.kinematic_problem import KinematicProblem
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.prepare import plan
 from vkc_pin.simulation.execution import GRASPS, simulate
@@ -124,7 +124,7 @@ def displace_hand(scene: Scene, distance: float, rng: np.random.Generator) -> Sc
 def _reach(scene: Scene, tool: pin.SE3) -> Floats | None:
     """Return the configuration near the start that brings the tool to a pose; None if none."""
     options = Options()
-    problem = TrajectoryProblem(scene, compile_task(scene, [Reach(tool)], options), options)
+    problem = KinematicProblem(scene, compile_task(scene, [Reach(tool)], options), options)
     search = KeyframeSampler(problem, np.random.default_rng(0))
     pose = search.find_pose(problem.segments)
     assert pose is not None

@@ -12,8 +12,8 @@ from vkc_pin.planning.initialization.keyframes import (
     find_free_configurations,
     sample_goal_configurations,
 )
+from vkc_pin.planning.nlp.kinematic_problem import KinematicProblem
 from vkc_pin.planning.nlp.merit import TOLERANCE
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arguments import check_bool, check_instance, check_integer
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.scene.scene import Scene
@@ -60,7 +60,7 @@ def inverse_kinematics(
     count = check_integer(count, "count", low=1)
     rng = np.random.default_rng(check_integer(seed, "seed", low=0))
     task = compile_task(scene, [Reach(pose, frame)], options)
-    problem = TrajectoryProblem(scene, task, options)
+    problem = KinematicProblem(scene, task, options)
     end = problem.segments
     if check_bool(fix_base, "fix_base"):
         lower, upper = problem.lower.copy(), problem.upper.copy()

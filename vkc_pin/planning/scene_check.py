@@ -14,8 +14,8 @@ from vkc_pin.options import Options
 from vkc_pin.planning.base_paths.reachable_floor import CELL, find_free_floor
 from vkc_pin.planning.diagnosis.diagnosis import diagnose_goals, find_impossible_conditions
 from vkc_pin.planning.initialization.keyframes import sample_goal_configurations
+from vkc_pin.planning.nlp.kinematic_problem import KinematicProblem
 from vkc_pin.planning.nlp.merit import TOLERANCE
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arguments import check_instance, check_integer
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.cache import Cache
@@ -170,8 +170,8 @@ def check_scene(scene: Scene, *, options: Options | None = None, seed: int = 0) 
     options = Options() if options is None else check_instance(options, Options, "options")
     seed, cache = check_integer(seed, "seed", low=0), Cache()
     reach = [Reach(scene.tool_placement())]
-    problem = TrajectoryProblem(
-        scene, compile_task(scene, reach, options, nothing=True), options, (), cache=cache
+    problem = KinematicProblem(
+        scene, compile_task(scene, reach, options, nothing=True), options, cache=cache
     )
     contacts = problem.contacts.evaluate(
         problem.start[None], np.array([0]), reach=options.dist_safe
@@ -236,11 +236,11 @@ def _check_attachments(
             except InputError as error:
                 yield ReachableAttachment(name, attachment, **about, because=str(error))
                 continue
-            problem = TrajectoryProblem(empty, task, options, (), cache=cache)
+            problem = KinematicProblem(empty, task, options, cache=cache)
             yield ReachableAttachment(name, attachment, **about, **_find_grasp(problem, seed))
 
 
-def _find_grasp(problem: TrajectoryProblem, seed: int) -> dict[str, Any]:
+def _find_grasp(problem: KinematicProblem, seed: int) -> dict[str, Any]:
     """Return the sampled grasp with the largest clearance, or the reason why there is none."""
     end, safe = int(problem.ends[-1]), problem.options.dist_safe
     for draw in range(3):

@@ -14,8 +14,8 @@ import pinocchio as pin
 
 from vkc_pin.planning.chain.inverse_kinematics import MAX_STEP
 from vkc_pin.planning.initialization.keyframes import KeyframeSampler
+from vkc_pin.planning.nlp.kinematic_problem import KinematicProblem
 from vkc_pin.planning.nlp.merit import TOLERANCE
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.solver.trust_region import CLEARANCE_TOLERANCE
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.utils.budget import record_evaluations
@@ -65,7 +65,7 @@ class ArmKinematics:
         columns: Decided coordinates: the arm's joints, and the freedoms of its grasps.
     """
 
-    def __init__(self, problem: TrajectoryProblem, sampler: KeyframeSampler) -> None:
+    def __init__(self, problem: KinematicProblem, sampler: KeyframeSampler) -> None:
         self.problem = problem
         self.sampler = sampler
         columns = list(range(3, sampler.robot_size))
@@ -142,7 +142,7 @@ class _Box:
 
 
 def refine_configuration(
-    problem: TrajectoryProblem,
+    problem: KinematicProblem,
     sampler: KeyframeSampler,
     z: Floats,
     *,
@@ -238,7 +238,7 @@ class FollowResult:
 
 
 def follow(
-    problem: TrajectoryProblem, base: Floats, rng: np.random.Generator, *, refine: bool
+    problem: KinematicProblem, base: Floats, rng: np.random.Generator, *, refine: bool
 ) -> FollowResult:
     """Find the arm for every waypoint from the one before.
 
@@ -269,7 +269,7 @@ class _Arm:
     """Finds the arm at single waypoints."""
 
     def __init__(
-        self, problem: TrajectoryProblem, sampler: KeyframeSampler, *, refine: bool
+        self, problem: KinematicProblem, sampler: KeyframeSampler, *, refine: bool
     ) -> None:
         self.problem = problem
         self.sampler = sampler

@@ -12,7 +12,7 @@ from vkc_pin.planning.base_paths.grid import HEADINGS, BaseGrid, compute_fine_ce
 from vkc_pin.planning.initialization.base_routes import collect_grid_shapes
 from vkc_pin.planning.initialization.initial_guess import InitialGuess
 from vkc_pin.planning.initialization.keyframes import sample_smoothstep
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.planning.nlp.kinematic_problem import KinematicProblem
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.models.coordinates import wrap_angle
 from vkc_pin.world.task.steps import GoTo
@@ -25,7 +25,7 @@ _MAX_DISTANCE = 0.08
 class BasePaths:
     """Paths of the base around fixed obstacles in the last phase of a problem."""
 
-    def __init__(self, problem: TrajectoryProblem, *, whole: bool = False) -> None:
+    def __init__(self, problem: KinematicProblem, *, whole: bool = False) -> None:
         """Make the grid; with `whole` for the robot with its present arm and grasped objects."""
         self.omni = problem.chain.robot.base == "omni"
         z = problem.start.copy()
@@ -75,7 +75,7 @@ class BasePaths:
         count = max(_MIN_POSES, int(np.ceil(np.hypot(dx, dy) / _MAX_DISTANCE)))
         return all(self.grid.is_pose_free(*pose) for pose in np.linspace(start, goal, count))
 
-    def find_base_path(self, problem: TrajectoryProblem, goal: Floats) -> Floats | None:
+    def find_base_path(self, problem: KinematicProblem, goal: Floats) -> Floats | None:
         """Return the base at every waypoint, shape (N, 3), stationary while a latch is released."""
         base = [problem.start[None, :3]]
         for phase in problem.task.phases:
@@ -88,7 +88,7 @@ class BasePaths:
             base.append(part)
         return np.concatenate(base[1:])
 
-    def make_guesses(self, problem: TrajectoryProblem, goals: Floats) -> Iterator[InitialGuess]:
+    def make_guesses(self, problem: KinematicProblem, goals: Floats) -> Iterator[InitialGuess]:
         """Yield the path from a problem's start to one of `goals`, shape (G, 3), if any."""
         path = self.path(problem.start[:3], goals, problem.segments)
         if path is not None:

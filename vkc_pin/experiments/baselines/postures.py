@@ -13,7 +13,7 @@ from vkc_pin.planning.initialization.keyframes import (
     KeyframeSampler,
     sample_smoothstep,
 )
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.planning.nlp.kinematic_problem import KinematicProblem
 from vkc_pin.planning.solver.trust_region import CLEARANCE_TOLERANCE
 from vkc_pin.utils.arrays import Floats
 
@@ -26,7 +26,7 @@ _SAME = 1e-6
 
 
 def find_base_poses(
-    problem: TrajectoryProblem, waypoint: int, near: Floats, rng: np.random.Generator
+    problem: KinematicProblem, waypoint: int, near: Floats, rng: np.random.Generator
 ) -> Floats:
     """Return feasible, collision-free configurations at a waypoint, shape (K, n), nearest first.
 
@@ -55,7 +55,7 @@ def find_base_poses(
     return z[np.argsort(np.abs(z - near) @ sampler.weights, kind="stable")]
 
 
-def generate_postures(problem: TrajectoryProblem) -> Iterator[Floats]:
+def generate_postures(problem: KinematicProblem) -> Iterator[Floats]:
     """Yield paths of the arm, shape (K, n), to collision-free postures for driving.
 
     They are: no motion (K = 0); away from a released object, or up with a grasped one; from there
@@ -87,13 +87,13 @@ def generate_postures(problem: TrajectoryProblem) -> Iterator[Floats]:
         yield path
 
 
-def is_at_home(problem: TrajectoryProblem) -> bool:
+def is_at_home(problem: KinematicProblem) -> bool:
     """Return whether the arm is at home at the start."""
     robot = problem.chain.robot
     return bool(np.abs(problem.start[3 : robot.coordinates.size] - robot.home).max() < _SAME)
 
 
-def interpolate_path(problem: TrajectoryProblem, path: Floats) -> Floats:
+def interpolate_path(problem: KinematicProblem, path: Floats) -> Floats:
     """Return waypoints from the start through configurations, shape (K, n): shape (N, n)."""
     points = np.vstack([problem.start, path])
     steps = np.abs(np.diff(points, axis=0)).max(axis=1)

@@ -12,8 +12,8 @@ from vkc_pin.planning.initialization.keyframes import (
     find_free_configurations,
     sample_goal_configurations,
 )
+from vkc_pin.planning.nlp.kinematic_problem import KinematicProblem
 from vkc_pin.planning.nlp.merit import TOLERANCE
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Violation
 from vkc_pin.validation.tolerances import Tolerances
@@ -47,7 +47,7 @@ class BlockedGoal(NamedTuple):
         return self.shortfall > _DEEP_SHORTFALL
 
 
-def find_impossible_conditions(problem: TrajectoryProblem) -> list[Violation]:
+def find_impossible_conditions(problem: KinematicProblem) -> list[Violation]:
     """Find violations that no motion can change, at the start or of goals beyond limits.
 
     They name waypoints, but no times, which depend on the motion in the plan.
@@ -73,7 +73,7 @@ def find_impossible_conditions(problem: TrajectoryProblem) -> list[Violation]:
     return found
 
 
-def _find_collisions_at_start(problem: TrajectoryProblem) -> list[Violation]:
+def _find_collisions_at_start(problem: KinematicProblem) -> list[Violation]:
     """Find the pairs of links that overlap at the start by more than the scene allows."""
     contacts = problem.contacts.evaluate(problem.start[None], np.array([0]), reach=0.0)
     labels = problem.contacts.phases[0].labels
@@ -94,7 +94,7 @@ def _find_collisions_at_start(problem: TrajectoryProblem) -> list[Violation]:
     return violations
 
 
-def _find_open_closures_at_start(problem: TrajectoryProblem) -> list[Violation]:
+def _find_open_closures_at_start(problem: KinematicProblem) -> list[Violation]:
     """Find the grasps of the start that the hand does not have there."""
     violations = []
     for goal, solver in zip(problem.pose_goals, problem.pose_solvers, strict=True):
@@ -115,7 +115,7 @@ def _find_open_closures_at_start(problem: TrajectoryProblem) -> list[Violation]:
     return violations
 
 
-def _find_collisions_at_goal(problem: TrajectoryProblem, end: int) -> list[Violation]:
+def _find_collisions_at_goal(problem: KinematicProblem, end: int) -> list[Violation]:
     """Find the pairs that are too close at a waypoint whatever the coordinates left free are."""
     lower = problem.lower[end - 1]
     upper = problem.upper[end - 1]
@@ -146,7 +146,7 @@ def _find_collisions_at_goal(problem: TrajectoryProblem, end: int) -> list[Viola
     return list(found.values())
 
 
-def diagnose_goals(problem: TrajectoryProblem, random_seed: int) -> list[BlockedGoal]:
+def diagnose_goals(problem: KinematicProblem, random_seed: int) -> list[BlockedGoal]:
     """Explain all goals of an unsolved problem without a known collision-free configuration."""
     blocked = []
     for number in range(len(problem.task.phases)):
@@ -156,7 +156,7 @@ def diagnose_goals(problem: TrajectoryProblem, random_seed: int) -> list[Blocked
     return blocked
 
 
-def diagnose_goal(problem: TrajectoryProblem, number: int, random_seed: int) -> BlockedGoal | None:
+def diagnose_goal(problem: KinematicProblem, number: int, random_seed: int) -> BlockedGoal | None:
     """Explain the goal of one phase; None if it has a collision-free configuration."""
     phase = problem.task.phases[number]
     end = int(problem.ends[number])
@@ -191,7 +191,7 @@ def diagnose_goal(problem: TrajectoryProblem, number: int, random_seed: int) -> 
     return BlockedGoal(text, float(shortfall[best]), number)
 
 
-def describe_free_range(problem: TrajectoryProblem, number: int, random_seed: int) -> str:
+def describe_free_range(problem: KinematicProblem, number: int, random_seed: int) -> str:
     """Describe how far the goal of an `Actuate` step has collision-free configurations.
 
     The positions between start and goal are bisected, with samples at each. Nothing is proven.
@@ -241,7 +241,7 @@ def describe_free_range(problem: TrajectoryProblem, number: int, random_seed: in
 
 
 def _has_free_sample(
-    problem: TrajectoryProblem, waypoint: int, samples: tuple[Floats, Floats] | None
+    problem: KinematicProblem, waypoint: int, samples: tuple[Floats, Floats] | None
 ) -> bool:
     """Return whether one of the samples reaches the goal of a waypoint without collision."""
     if samples is None:
@@ -251,7 +251,7 @@ def _has_free_sample(
 
 
 def _sample_goal(
-    problem: TrajectoryProblem, waypoint: int, rng: np.random.Generator
+    problem: KinematicProblem, waypoint: int, rng: np.random.Generator
 ) -> tuple[Floats, Floats] | None:
     """Sample goal configurations in up to `_MAX_BATCHES` batches, until one is collision-free."""
     batches: list[tuple[Floats, Floats]] = []

@@ -13,9 +13,9 @@ from vkc_pin.planning.initialization.keyframes import (
     find_free_configurations,
     sample_goal_configurations,
 )
+from vkc_pin.planning.nlp.kinematic_problem import KinematicProblem
 from vkc_pin.planning.nlp.merit import TOLERANCE
 from vkc_pin.planning.nlp.pose_goals import find_phase_spans
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation.report import Report
 
@@ -35,7 +35,7 @@ class PathDiagnosis(NamedTuple):
 
 
 def diagnose_paths(
-    problem: TrajectoryProblem, z: Floats, report: Report, blocked: Sequence[str], random_seed: int
+    problem: KinematicProblem, z: Floats, report: Report, blocked: Sequence[str], random_seed: int
 ) -> PathDiagnosis:
     """Find the phases of a failed motion that have no path.
 
@@ -106,7 +106,7 @@ def _has_collision(report: Report, begin: int, end: int) -> bool:
 
 
 def _find_base_goals(
-    problem: TrajectoryProblem, number: int, last: Floats, random_seed: int
+    problem: KinematicProblem, number: int, last: Floats, random_seed: int
 ) -> tuple[Floats, str]:
     """Return possible base poses, shape (G, 3), at the end of a phase, and their description.
 

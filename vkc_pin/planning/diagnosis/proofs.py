@@ -18,8 +18,8 @@ from vkc_pin.planning.base_paths.reachable_floor import (
     find_blocked_cells,
     flood_fill,
 )
+from vkc_pin.planning.nlp.kinematic_problem import KinematicProblem
 from vkc_pin.planning.nlp.pose_goals import PoseGoal
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.world.scene.clearance_exemptions import PlacedShapes, find_clearance_exemptions
 from vkc_pin.world.scene.obstacles import FLOOR
@@ -66,7 +66,7 @@ class _PhaseFloor(NamedTuple):
     names: Sequence[str]
 
 
-def find_proofs(problem: TrajectoryProblem) -> list[str]:
+def find_proofs(problem: KinematicProblem) -> list[str]:
     """Explain why a task is certainly impossible; the result is empty if nothing is proven.
 
     Attached objects are no obstacles, nor are objects that the motion itself leaves at a place of
@@ -88,7 +88,7 @@ def find_proofs(problem: TrajectoryProblem) -> list[str]:
 
 
 def _explain_missing_path_of_point(
-    problem: TrajectoryProblem, point: Floats, goals: Sequence[Sequence[_BaseGoal]]
+    problem: KinematicProblem, point: Floats, goals: Sequence[Sequence[_BaseGoal]]
 ) -> str:
     """Explain why a point of the base certainly has no path from goal to goal; empty if it may.
 
@@ -118,7 +118,7 @@ def _explain_missing_path_of_point(
     return _explain_missing_path(problem, start, parts, CellGrid.over(begin, end, step))
 
 
-def _find_tracked_points(problem: TrajectoryProblem) -> list[Floats]:
+def _find_tracked_points(problem: KinematicProblem) -> list[Floats]:
     """Return points of the base to track, (2,) [m] each: its origin, and where it is highest."""
     shapes = []
     for shape in problem.chain.robot.collision.geometryObjects:
@@ -132,7 +132,7 @@ def _find_tracked_points(problem: TrajectoryProblem) -> list[Floats]:
     return [np.zeros(2), (corners.min(axis=0) + corners.max(axis=0)) / 2.0]
 
 
-def _find_base_goals(problem: TrajectoryProblem, number: int) -> tuple[list[_BaseGoal], list[str]]:
+def _find_base_goals(problem: KinematicProblem, number: int) -> tuple[list[_BaseGoal], list[str]]:
     """Return necessary base positions at a phase's end, and reasons why goals are unreachable."""
     phase = problem.task.phases[number]
     end = int(problem.ends[number])
@@ -172,7 +172,7 @@ def _describe_height(goal: PoseGoal, shoulder: Floats, length: float) -> str:
 
 
 def _compute_arm_reach(
-    problem: TrajectoryProblem, joint: int, local: Floats
+    problem: KinematicProblem, joint: int, local: Floats
 ) -> tuple[Floats, float]:
     """Return the position of a frame's first joint in the base, (3,), and the reach from it [m]."""
     chain = problem.chain
@@ -190,7 +190,7 @@ def _compute_arm_reach(
 
 
 def _collect_walls(
-    problem: TrajectoryProblem, number: int, point: Floats
+    problem: KinematicProblem, number: int, point: Floats
 ) -> tuple[list[Wall], list[str]]:
     """Return the walls that keep a point of the base away in a phase, and their names."""
     part = problem.contacts.phases[number]
@@ -240,7 +240,7 @@ def _has_path(start: Floats, parts: Sequence[_PhaseFloor], cells: CellGrid) -> b
 
 
 def _explain_missing_path(
-    problem: TrajectoryProblem, start: Floats, parts: Sequence[_PhaseFloor], cells: CellGrid
+    problem: KinematicProblem, start: Floats, parts: Sequence[_PhaseFloor], cells: CellGrid
 ) -> str:
     """Explain the first phase whose goals the base certainly cannot reach, if any."""
     half = cells.step * float(np.sqrt(0.5))
@@ -345,7 +345,7 @@ def _minimize_obstacles(
     return sorted(kept)
 
 
-def _list_names(problem: TrajectoryProblem, phase: Phase, names: Sequence[str]) -> str:
+def _list_names(problem: KinematicProblem, phase: Phase, names: Sequence[str]) -> str:
     """List names in a sentence, with the joint positions of articulated objects among them."""
     distinct = list(dict.fromkeys(names))
     text = ", ".join(distinct[:_MAX_NAMES])
@@ -365,7 +365,7 @@ def _list_names(problem: TrajectoryProblem, phase: Phase, names: Sequence[str]) 
     return text
 
 
-def find_swept_collisions(problem: TrajectoryProblem) -> list[str]:
+def find_swept_collisions(problem: KinematicProblem) -> list[str]:
     """Explain which object joint certainly cannot reach its goal; empty if nothing is proven.
 
     A link that depends on a single joint passes all positions between start and goal on any motion.
@@ -378,7 +378,7 @@ def find_swept_collisions(problem: TrajectoryProblem) -> list[str]:
     return []
 
 
-def _find_collision(problem: TrajectoryProblem, phase: Phase, coordinate: str) -> str:
+def _find_collision(problem: KinematicProblem, phase: Phase, coordinate: str) -> str:
     """Return which link a joint moves into what in a phase; empty if no collision is certain."""
     name, _, joint = coordinate.partition(".")
     placed = problem.scene.objects[name]
@@ -418,7 +418,7 @@ class _Sweep:
     """
 
     def __init__(
-        self, problem: TrajectoryProblem, placed: PlacedObject, joint: str, values: Floats
+        self, problem: KinematicProblem, placed: PlacedObject, joint: str, values: Floats
     ) -> None:
         scene = problem.scene
         task = problem.task

@@ -12,7 +12,7 @@ from vkc_pin.planning.diagnosis.diagnosis import (
     find_impossible_conditions,
 )
 from vkc_pin.planning.diagnosis.proofs import find_proofs, find_swept_collisions
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.planning.nlp.kinematic_problem import KinematicProblem
 from vkc_pin.utils.budget import BudgetExhaustedError
 from vkc_pin.validation.report import Violation
 
@@ -34,14 +34,14 @@ class TaskDiagnosis:
         self._random_seed = random_seed
         self._goals: dict[int, BlockedGoal | None] = {}
 
-    def find_conditions(self, problem: TrajectoryProblem) -> list[Violation]:
+    def find_conditions(self, problem: KinematicProblem) -> list[Violation]:
         """Return conditions at start and goals that no motion can satisfy."""
         conditions = find_impossible_conditions(problem)
         if conditions:
             self.is_grasp_independent = True
         return conditions
 
-    def find_proofs(self, problem: TrajectoryProblem) -> list[str]:
+    def find_proofs(self, problem: KinematicProblem) -> list[str]:
         """Return proofs of infeasibility; without any, the result is empty."""
         if self.proofs is None:
             collisions = find_swept_collisions(problem)
@@ -51,7 +51,7 @@ class TaskDiagnosis:
         return self.proofs
 
     def find_blocked_goals(
-        self, problem: TrajectoryProblem, numbers: Iterable[int] | None = None
+        self, problem: KinematicProblem, numbers: Iterable[int] | None = None
     ) -> list[BlockedGoal]:
         """Return the goals of phases without a known collision-free configuration.
 
@@ -70,7 +70,7 @@ class TaskDiagnosis:
                 blocked.append(goal)
         return blocked
 
-    def is_infeasible(self, problem: TrajectoryProblem, numbers: Iterable[int]) -> bool:
+    def is_infeasible(self, problem: KinematicProblem, numbers: Iterable[int]) -> bool:
         """Return whether a task is proven infeasible, or a goal of some phases blocked deeply.
 
         Args:
@@ -81,7 +81,7 @@ class TaskDiagnosis:
             return True
         return any(goal.is_deep for goal in self.find_blocked_goals(problem, numbers))
 
-    def describe_goal(self, problem: TrajectoryProblem, goal: BlockedGoal) -> str:
+    def describe_goal(self, problem: KinematicProblem, goal: BlockedGoal) -> str:
         """Return why a goal is blocked, and how far it is free, within the budget."""
         free = ""
         with contextlib.suppress(BudgetExhaustedError):

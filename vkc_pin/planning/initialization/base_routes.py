@@ -13,7 +13,7 @@ from vkc_pin.planning.base_paths.base_clearance import Shape, compute_hull_point
 from vkc_pin.planning.base_paths.base_path import BasePath, sample_poses, shortest_path
 from vkc_pin.planning.base_paths.grid import BaseGrid, compute_fine_cell_count
 from vkc_pin.planning.initialization.keyframes import SIMILARITY_TOLERANCE, compute_shortfall
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.planning.nlp.kinematic_problem import KinematicProblem
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.collision.solids import count_threads
 from vkc_pin.world.scene.hold import Hold
@@ -33,7 +33,7 @@ class BaseRoutes:
     the middle of any passage that is wide enough for the margins, and only contact counts.
     """
 
-    def __init__(self, problem: TrajectoryProblem) -> None:
+    def __init__(self, problem: KinematicProblem) -> None:
         self.problem = problem
         self.chain = problem.chain
         self.arm = slice(3, self.chain.robot.coordinates.size)
@@ -188,7 +188,7 @@ class BaseRoutes:
         return sample_path(corners, steps, turning=turning)
 
 
-def find_folded_arms(problem: TrajectoryProblem, phase: int, resting: Floats) -> Floats:
+def find_folded_arms(problem: KinematicProblem, phase: int, resting: Floats) -> Floats:
     """Find compact arm postures among random ones, the same every time.
 
     The first posture minimizes the sum of the extents of arm and load from the base's origin along
@@ -234,7 +234,7 @@ def find_folded_arms(problem: TrajectoryProblem, phase: int, resting: Floats) ->
     return np.array(home[None])
 
 
-def _compute_reach(problem: TrajectoryProblem, phase: int, z: Floats) -> tuple[Floats, Floats]:
+def _compute_reach(problem: KinematicProblem, phase: int, z: Floats) -> tuple[Floats, Floats]:
     """Return extents along the base's axes of arm and load, (B, 3), and of the base, (3,) [m]."""
     rotations, translations = problem.chain.joint_placements(z)
     base_rotations = rotations[:, 1]
@@ -257,7 +257,7 @@ def _compute_reach(problem: TrajectoryProblem, phase: int, z: Floats) -> tuple[F
     return reach, base
 
 
-def _collect_moving_shapes(problem: TrajectoryProblem, phase: int) -> list[pin.GeometryObject]:
+def _collect_moving_shapes(problem: KinematicProblem, phase: int) -> list[pin.GeometryObject]:
     """Return the shapes of the robot and of its load."""
     robot = range(len(problem.chain.robot.collision.geometryObjects))
     attached = problem.contacts.find_attached_geometries(phase)
@@ -265,7 +265,7 @@ def _collect_moving_shapes(problem: TrajectoryProblem, phase: int) -> list[pin.G
 
 
 def collect_grid_shapes(
-    problem: TrajectoryProblem, phase: int, z: Floats
+    problem: KinematicProblem, phase: int, z: Floats
 ) -> tuple[list[tuple[int, Shape]], list[Shape]]:
     """Collect the shapes of a base grid.
 

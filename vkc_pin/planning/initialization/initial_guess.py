@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.planning.nlp.kinematic_problem import KinematicProblem
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.task.phases import PhaseKey
 from vkc_pin.world.trajectory.splicing import fill_missing_values
@@ -60,7 +60,7 @@ class PhaseWaypoints:
 
 
 def extract_phase_waypoints(
-    problem: TrajectoryProblem, z: Floats, initialization: str
+    problem: KinematicProblem, z: Floats, initialization: str
 ) -> PhaseWaypoints:
     """Return z_1..z_N of a problem, shape (N, n), as waypoints of its phases."""
     phases = tuple(phase.key for phase in problem.task.phases)
@@ -70,7 +70,7 @@ def extract_phase_waypoints(
     return PhaseWaypoints(phases, problem.chain.names, waypoints, initialization)
 
 
-def make_initial_guess(problem: TrajectoryProblem, parts: Sequence[PhaseWaypoints]) -> InitialGuess:
+def make_initial_guess(problem: KinematicProblem, parts: Sequence[PhaseWaypoints]) -> InitialGuess:
     """Concatenate waypoints of parts of a task to an initial guess for the whole task."""
     chain = problem.chain
     phases = iter(problem.task.phases)
@@ -94,7 +94,7 @@ def make_initial_guess(problem: TrajectoryProblem, parts: Sequence[PhaseWaypoint
     return InitialGuess(name, z, radius=np.full(problem.segments, _WARM_RADIUS))
 
 
-def make_guess_from_motion(problem: TrajectoryProblem, motion: Trajectory) -> InitialGuess:
+def make_guess_from_motion(problem: KinematicProblem, motion: Trajectory) -> InitialGuess:
     """Make an initial guess from an earlier motion of the same steps, or of some of them.
 
     A phase starts from the motion's next phase of the same name. Phases without one, and
@@ -139,7 +139,7 @@ def _resample(waypoints: Floats, segments: int) -> Floats:
 
 
 def perturb(
-    problem: TrajectoryProblem, z: Floats, deviation: float, rng: np.random.Generator
+    problem: KinematicProblem, z: Floats, deviation: float, rng: np.random.Generator
 ) -> Floats:
     """Add smooth noise of some standard deviation [m] or [rad] to the robot's part of z, (N, n).
 

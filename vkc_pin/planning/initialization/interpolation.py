@@ -327,9 +327,9 @@ class Interpolator:
         problem = self.problem
         columns = self.sampler.object_columns
         z[:, columns] = objects[:, columns]
-        for pose, row in enumerate(problem.transcription.structure.poses):
-            if len(row.waypoints) > 1:
-                rows = np.array(row.waypoints) - 1
+        for pose, goal in enumerate(problem.pose_goals):
+            if len(goal.row.waypoints) > 1:
+                rows = np.array(goal.row.waypoints) - 1
                 lower = problem.lower[rows].copy()
                 upper = problem.upper[rows].copy()
                 for limits in (lower, upper):

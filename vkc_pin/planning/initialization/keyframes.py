@@ -10,8 +10,8 @@ import pinocchio as pin
 
 from vkc_pin.planning.base_paths.arcs import Curves, find_nearest_arc
 from vkc_pin.planning.chain.inverse_kinematics import MAX_STEP, PoseSolver
+from vkc_pin.planning.nlp.kinematic_problem import KinematicProblem
 from vkc_pin.planning.nlp.merit import TOLERANCE
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.world.scene.clearance_exemptions import ACCEPTED_SHORTFALL
 
@@ -78,7 +78,7 @@ class KeyframeSampler:
 
     def __init__(
         self,
-        problem: TrajectoryProblem,
+        problem: KinematicProblem,
         rng: np.random.Generator,
         cache: KeyframeCache | None = None,
     ) -> None:
@@ -98,8 +98,8 @@ class KeyframeSampler:
 
     def find_pose(self, waypoint: int) -> int | None:
         """Return the index of the pose constraint at a waypoint; None: at most a level one."""
-        for k, pose in enumerate(self.problem.transcription.structure.poses):
-            if waypoint in pose.waypoints and pose.kind != "level":
+        for k, goal in enumerate(self.problem.pose_goals):
+            if waypoint in goal.row.waypoints and goal.row.kind != "level":
                 return k
         return None
 
@@ -368,7 +368,7 @@ class KeyframeSampler:
 
 
 def compute_shortfall(
-    problem: TrajectoryProblem,
+    problem: KinematicProblem,
     z: Floats,
     waypoint: int,
     *,
@@ -390,7 +390,7 @@ def compute_shortfall(
     return contacts.compute_shortfall(len(z))
 
 
-def find_free_configurations(problem: TrajectoryProblem, z: Floats, waypoint: int) -> Bools:
+def find_free_configurations(problem: KinematicProblem, z: Floats, waypoint: int) -> Bools:
     """Return which configurations keep the clearance that validation demands, shape (B,).
 
     Args:
@@ -404,7 +404,7 @@ def find_free_configurations(problem: TrajectoryProblem, z: Floats, waypoint: in
 
 
 def sample_goal_configurations(
-    problem: TrajectoryProblem, waypoint: int, rng: np.random.Generator
+    problem: KinematicProblem, waypoint: int, rng: np.random.Generator
 ) -> tuple[Floats, Floats] | None:
     """Sample random configurations at the goal of a waypoint.
 
@@ -446,7 +446,7 @@ def sample_smoothstep(steps: int) -> Floats:
     return s * s * (3.0 - 2.0 * s)
 
 
-def interpolate_object_joints(problem: TrajectoryProblem, z: Floats) -> Floats:
+def interpolate_object_joints(problem: KinematicProblem, z: Floats) -> Floats:
     """Move the object joints in z, shape (N, n), to their goals phase by phase."""
     begin = 0
     current = problem.start.copy()

@@ -21,6 +21,7 @@ from vkc_pin.planning.initialization.keyframes import (
     KeyframeSampler,
     interpolate_object_joints,
 )
+from vkc_pin.planning.nlp.kinematic_problem import KinematicProblem
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats
 
@@ -68,7 +69,15 @@ def initialize(
         guesses = _generate_stationary_guesses(problem, 2 * count - 1, rng)
     else:
         notes = [] if notes is None else notes
-        shared = _Shared(problem, random_seed, notes, BaseRoutes(problem), KeyframeCache(), effort)
+        shared = _Shared(
+            problem,
+            problem.compute_cost,
+            random_seed,
+            notes,
+            BaseRoutes(problem),
+            KeyframeCache(),
+            effort,
+        )
         if method == "auto":
             kinds = ["interpolated", "astar", "rrt"]
             if problem.chain.robot.base == "fixed":
@@ -133,7 +142,7 @@ def interleave_guesses(*kinds: _Kind) -> Iterator[InitialGuess]:
 
 
 def _generate_stationary_guesses(
-    problem: TrajectoryProblem, count: int, rng: np.random.Generator
+    problem: KinematicProblem, count: int, rng: np.random.Generator
 ) -> Iterator[InitialGuess]:
     """Generate a guess with a stationary robot, then others in which the base moves straight.
 
@@ -165,7 +174,8 @@ def _generate_stationary_guesses(
 class _Shared:
     """Data that the searches of one problem share."""
 
-    problem: TrajectoryProblem
+    problem: KinematicProblem
+    compute_cost: Callable[[Floats], float]
     random_seed: int
     notes: list[str]
     routes: BaseRoutes
@@ -202,6 +212,7 @@ class _GuessSearch:
 
     def __init__(self, shared: _Shared, method: str) -> None:
         self.problem = shared.problem
+        self.compute_cost = shared.compute_cost
         self.notes = shared.notes
         self.method = method
         self.beam, self.interpolator = self._make_parts(shared)
@@ -290,7 +301,7 @@ class _GuessSearch:
             shortfall = contacts.compute_shortfall(len(z))
             penetration = float(max(shortfall.max() - options.dist_safe, 0.0))
             total = float(shortfall.sum())
-            merit = problem.objective(z, problem.timing_for(z).dt) + options.penalty * total
+            merit = self.compute_cost(z) + options.penalty * total
             if merit < least_merit:
                 best = (path, z, penetration)
                 least_merit = merit

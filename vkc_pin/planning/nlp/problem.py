@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import itertools
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -11,18 +10,13 @@ import numpy as np
 
 from vkc_pin.errors import InputError
 from vkc_pin.options import Options
-from vkc_pin.planning.chain.chain import VirtualKinematicChain, consolidate
-from vkc_pin.planning.chain.contacts import ContactModel, Contacts
-from vkc_pin.planning.chain.inverse_kinematics import PoseSolver
 from vkc_pin.planning.chain.pose import ROW_BOUNDS
+from vkc_pin.planning.nlp.kinematic_problem import KinematicProblem
 from vkc_pin.planning.nlp.objective import MotionCost
 from vkc_pin.planning.nlp.pose_goals import (
     find_approach_waypoint,
-    find_chosen_freedoms,
-    find_end_of_hold,
     find_phase_spans,
     find_pushed_coordinates,
-    make_pose_goals,
 )
 from vkc_pin.planning.nlp.term_locations import TermEvaluator, locate_terms
 from vkc_pin.planning.nlp.term_rows import TermRow
@@ -36,48 +30,32 @@ from vkc_pin.planning.nlp.transcription import transcribe
 from vkc_pin.planning.nlp.waypoint import Structure
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.cache import Cache
-from vkc_pin.validation.tolerances import Tolerances
 from vkc_pin.world.collision.solids import flatten_placements
-from vkc_pin.world.models.coordinates import wrap_angle
-from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.phases import Phase, Task
+from vkc_pin.world.task.phases import Task
 from vkc_pin.world.task.terms import Term
-from vkc_pin.world.trajectory.wheels import make_rolling_limits
 
 # Relative cost of coordinates that are chosen at the grasp and constant afterwards; it only
 # regularises the problem.
 _CHOSEN_FREEDOM_WEIGHT = 1e-4
-_TOLERANCES = Tolerances()
 # [m/s], [rad/s] with which a start velocity may open the closure of a grasped object, as where it
 # is not exactly where the motion was planned. At 1 m/s², such a hand is brought back within 0.5 mm.
 _MAX_CLOSURE_SPEED = 0.03
 
 
-class TrajectoryProblem:
-    """A task in a scene, ready to be solved.
+class TrajectoryProblem(KinematicProblem):
+    """A task in a scene, ready to be solved: the chain's motion, its cost and its constraints.
 
     It is immutable. The duration of steps belongs to a motion, see `timing_for`.
 
     Attributes:
-        scene, task, options: Scene, task and options that it was built from.
-        chain: Virtual kinematic chain with n coordinates.
-        rolling: Motion constraints of its base.
-        contacts: Collision model of the task.
-        transcription: Symbolic program, shared between problems of one structure.
+        transcription: Symbolic program, shared between problems of one structure. Each of
+            `pose_goals` belongs to one of `transcription.structure.poses`.
         motion_cost: Cost of the motion.
-        start: z_0, shape (n,).
         end_velocities: Velocities at the start and the end of the motion, shape (2, n).
-        lower, upper: Bounds of z_1..z_N, shape (N, n): joint limits (eq. 4), fixed coordinates,
-            joint goals.
-        pose_goals: Pose goals (eqs. 2 and 3), one for each of `transcription.structure.poses`.
-        targets: Their target placements.
-        pose_solvers: Inverse kinematics of each.
-        choices: Freedoms chosen when a hand clamps: column, grasp waypoint and last waypoint held.
         terms: User-defined constraints and costs that can change something in this task, one for
             each of `transcription.structure.terms`.
         term_evaluator: Evaluates the terms along a motion.
-        cache: Cache of the symbolic program and of what searches build.
     """
 
     def __init__(
@@ -89,56 +67,16 @@ class TrajectoryProblem:
         *,
         cache: Cache | None = None,
     ) -> None:
-        self.scene = scene
-        self.task = task
-        self.options = options
-        self.cache = cache or Cache()
-        self.chain: VirtualKinematicChain = consolidate(
-            scene, task.holds, rides=task.supported, cache=self.cache
-        )
-        self.rolling = make_rolling_limits(self.chain.robot)
-        self.contacts = ContactModel(scene, self.chain, task, options)
-        self.ends = np.cumsum([phase.segments for phase in task.phases])
-        self.pose_goals = make_pose_goals(scene, self.chain, task, options)
-        self.choices = find_chosen_freedoms(scene, self.chain, task)
-        self.targets = tuple(goal.target for goal in self.pose_goals)
+        super().__init__(scene, task, options, cache=cache)
         rows, self.terms = locate_terms(scene, self.chain, task, terms)
         self.transcription = transcribe(self._make_structure(rows), self.cache)
-        self.pose_solvers = tuple(
-            PoseSolver(self.chain.tree, goal.row, goal.local, self.cache)
-            for goal in self.pose_goals
-        )
         self.motion_cost = self._make_motion_cost()
-        self.start = self._make_start()
         self.end_velocities = self._make_end_velocities()
-        self.lower, self.upper = self._make_bounds()
-        self.start.setflags(write=False)
         self.end_velocities.setflags(write=False)
-        self.lower.setflags(write=False)
-        self.upper.setflags(write=False)
         self.term_evaluator = TermEvaluator(
             self.terms, self.transcription, self.start, self.chain.tree.mounts
         )
         self.term_evaluator.check(self.still, np.full(self.segments, options.dt))
-
-    def with_bounds(self, lower: Floats, upper: Floats) -> TrajectoryProblem:
-        """Return the same problem with other bounds of z_1..z_N, shape (N, n)."""
-        other = copy.copy(self)
-        other.lower = lower.copy()
-        other.upper = upper.copy()
-        other.lower.setflags(write=False)
-        other.upper.setflags(write=False)
-        return other
-
-    @property
-    def segments(self) -> int:
-        """N, the number of waypoints after the start."""
-        return int(self.ends[-1])
-
-    @property
-    def still(self) -> Floats:
-        """z_1..z_N of the stationary motion, shape (N, n)."""
-        return np.tile(self.start, (self.segments, 1))
 
     def _make_structure(self, terms: tuple[TermRow, ...]) -> Structure:
         """Return the structure of the program: pose goals, stops, clamped coordinates, etc."""
@@ -186,18 +124,6 @@ class TrajectoryProblem:
             length=o.objective == "path_length",
         )
 
-    def _make_start(self) -> Floats:
-        """Return z_0: the robot, joints of objects, and freedoms of grasps at the start."""
-        start = np.zeros(self.chain.size)
-        start[: len(self.scene.start)] = self.scene.start
-        for name, value in self.task.state.items():
-            start[self.chain.index(name)] = value
-        for hold in self._continued_holds:
-            attachment = self.scene.objects[hold.object].object.attachment(hold.attachment)
-            for name, value in zip(attachment.coordinates, hold.at, strict=True):
-                start[self.chain.index(f"{hold.object}.{name}")] = value
-        return start
-
     def _make_end_velocities(self) -> Floats:
         """Return the velocities at the start, as the scene states it, and at the end, as the task.
 
@@ -221,7 +147,7 @@ class TrajectoryProblem:
         size = len(robot_velocity)
         velocities[0, :size] = robot_velocity
         jacobians = [np.zeros((0, self.chain.size))]
-        held = {hold.object for hold in self._continued_holds}
+        held = {hold.object for hold in self.continued_holds}
         for goal, solver in zip(self.pose_goals, self.pose_solvers, strict=True):
             if goal.kind == "closure" and goal.object in held:
                 _, jacobian = solver.evaluate(self.start[None], goal.target)
@@ -240,36 +166,6 @@ class TrajectoryProblem:
         velocities[0, size:] = others
         return velocities
 
-    @property
-    def _continued_holds(self) -> list[Hold]:
-        """Holds at the start that the task does not release at once."""
-        return [hold for hold in self.scene.holds if hold in self.task.holds]
-
-    def _make_bounds(self) -> tuple[Floats, Floats]:
-        """Return the joint limits (eq. 4) per waypoint, narrowed by phases and clamped grasps."""
-        bounds = np.empty((self.segments, self.chain.size, 2))
-        bounds[:] = np.column_stack([self.chain.lower, self.chain.upper])
-        for column, name in enumerate(self.chain.names[:3]):
-            bounds[:, column] = self.limits(name)
-        robot = slice(self.chain.robot.coordinates.size)
-        for phase, first, end in find_phase_spans(self.task):
-            inside = slice(first, end)  # row t belongs to waypoint t + 1
-            if phase.kind == "stand" and not self.is_closed(phase):
-                bounds[inside, robot] = self.start[robot, None]  # a released object does not move
-            for name, value in phase.initial_values.items():
-                bounds[inside, self.chain.index(name)] = phase.ranges.get(name, (value, value))
-            for name, interval in self.coordinate_goals(phase).items():
-                bounds[end - 1, self.chain.index(name)] = np.clip(interval, *self.limits(name))
-        # Clamped freedoms are constant until the object is released.
-        for hold in self._continued_holds:
-            if self.scene.objects[hold.object].object.attachments[hold.attachment].firm:
-                until = find_end_of_hold(hold, find_phase_spans(self.task), 0)
-                for name in self.chain.virtual[hold]:
-                    column = self.chain.index(name)
-                    bounds[:until, column] = self.start[column]
-        lower, upper = bounds.transpose(2, 0, 1).copy()
-        return lower, upper
-
     def timing_for(self, z: Floats) -> Timing:
         """Return the step durations for the initial guess z_1..z_N, shape (N, n).
 
@@ -286,65 +182,6 @@ class TrajectoryProblem:
         if structure.is_timed:
             dt = self.term_evaluator.lengthen_steps(z, dt, runs)
         return Timing(dt, dt, runs, limits, self.end_velocities)
-
-    def is_closed(self, phase: Phase) -> bool:
-        """Return whether the chain is closed, by a grasp of an object fixed in the world."""
-        return any(not self.scene.objects[hold.object].object.free for hold in phase.held)
-
-    def limits(self, name: str) -> tuple[float, float]:
-        """Return the position limits of a coordinate.
-
-        The base is limited by the arena; a fixed base stays at the start.
-        """
-        column = self.chain.index(name)
-        if column < 3 and self.chain.robot.base == "fixed":
-            return float(self.start[column]), float(self.start[column])
-        lower = float(self.chain.lower[column])
-        upper = float(self.chain.upper[column])
-        if column < 2:
-            arena_lower, arena_upper = self.scene.arena[2 * column : 2 * column + 2]
-            lower = max(lower, arena_lower)
-            upper = min(upper, arena_upper)
-        return lower, upper
-
-    def coordinate_goals(self, phase: Phase) -> dict[str, tuple[float, float]]:
-        """Return coordinate → (lower, upper) at the end of a phase, as requested, [m] and [rad].
-
-        Of equivalent angles without limits, such as headings, it is the one nearest to the start.
-        """
-        goals = {name: (value, value) for name, value in phase.values.items()}
-        for name, (lower, upper) in phase.configuration.items():
-            column = self.chain.index(name)
-            full_turns = 0.0  # [rad], a multiple of 2π
-            if self.chain.robot.is_periodic(column):
-                from_start = (lower + upper) / 2 - self.start[column]
-                full_turns = wrap_angle(from_start) - from_start
-            goals[name] = (lower + full_turns, upper + full_turns)
-        return goals
-
-    def unit(self, name: str) -> str:
-        """Return the unit of a coordinate, "m" or "rad"."""
-        return self.chain.coordinates.units[self.chain.index(name)]
-
-    def waypoints(self, z: Floats) -> Floats:
-        """Return z_0..z_N, shape (N + 1, n), given z_1..z_N, shape (N, n)."""
-        return np.vstack([self.start, z])
-
-    def clip(self, z: Floats) -> Floats:
-        """Return `z` clipped to the bounds."""
-        return np.clip(z, self.lower, self.upper)
-
-    def evaluate_contacts(self, z: Floats, *, reach: float, nearest: int | None = None) -> Contacts:
-        """Return the pairs closer than `reach` [m] at z_1..z_N, shape (N, n).
-
-        Args:
-            z: z_1..z_N.
-            reach: Pairs further apart are omitted [m].
-            nearest: Maximum number of pairs per waypoint. Defaults to all.
-        """
-        contacts = self.contacts.with_released_objects(z)
-        waypoints = np.arange(1, self.segments + 1)
-        return contacts.evaluate(z, waypoints, reach=reach, nearest=nearest)
 
     def rates(self, z: Floats, dt: Floats) -> tuple[Floats, Floats]:
         """Return the steps δz, shape (N, n), and their changes δδz, shape (N + 1 + stops, n).
@@ -366,14 +203,9 @@ class TrajectoryProblem:
         """Return the cost of z_1..z_N, shape (N, n), with step durations dt, shape (N,) [s]."""
         return self.motion_cost.value(*self.rates(z, dt)) + self.term_evaluator.compute_cost(z, dt)
 
-    def pose_error(self, z: Floats) -> float:
-        """Return the largest residual of closure (eq. 2), goals (eq. 3) and rolling [m], [rad]."""
-        errors = [0.0]
-        for goal, solver in zip(self.pose_goals, self.pose_solvers, strict=True):
-            if goal.row.waypoints:
-                residual, _ = solver.evaluate(z[np.array(goal.row.waypoints) - 1], goal.target)
-                errors.append(float(np.abs(residual).max()))
-        return max(*errors, self.rolling.compute_error(self.waypoints(z)))
+    def compute_cost(self, z: Floats) -> float:
+        """Return the cost of an initial guess z_1..z_N, shape (N, n), at its own timing."""
+        return self.objective(z, self.timing_for(z).dt)
 
     def row_error(self, z: Floats, dt: Floats) -> float:
         """Return the larger of `pose_error` and the violation of user-defined constraints."""
@@ -407,25 +239,6 @@ class TrajectoryProblem:
         clamped = np.where((rolling == 0.0) & (terms == 0.0), 1.0, 0.0)
         kinds = {"rolling": rolling, "clamped": clamped, "terms": terms}
         return {kind: factors[t.first_relaxed_row :] for kind, factors in kinds.items()}
-
-    def drift(self, z: Floats) -> float:
-        """Return the largest closure error between waypoints, relative to the tolerances.
-
-        It is evaluated half-way between consecutive waypoints.
-        """
-        path = self.waypoints(z)
-        midpoints = (path[1:] + path[:-1]) / 2
-        allowed = np.array([_TOLERANCES.closure_position, _TOLERANCES.closure_angle])
-        worst = 0.0
-        for goal, solver in zip(self.pose_goals, self.pose_solvers, strict=True):
-            at = goal.row.waypoints
-            closed_segments = [t - 1 for t in at if t - 1 in at]  # closed at both ends
-            if closed_segments and goal.kind == "closure":
-                residual, _ = solver.evaluate(midpoints[closed_segments], goal.target)
-                errors = residual.reshape(len(closed_segments), 2, 3)  # position and rotation
-                amounts = np.linalg.norm(errors, axis=2)
-                worst = max(worst, float((amounts / allowed).max()))
-        return worst
 
     def row_bounds(self, timing: Timing | None) -> tuple[Floats, Floats]:
         """Return the bounds of the rows, followed by those of the rates if a timing is given."""

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vkc_pin.planning.chain.contacts import ContactModel, Contacts, make_empty_contacts
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
+from vkc_pin.planning.nlp.kinematic_problem import KinematicProblem
 from vkc_pin.planning.solver.trust_region import CLEARANCE_TOLERANCE
 from vkc_pin.utils.arrays import Floats, Ints
 
@@ -97,7 +97,7 @@ class SegmentContacts(NamedTuple):
     crossings: list[Crossing]
 
 
-def find_segment_contacts(problem: TrajectoryProblem, z: Floats) -> SegmentContacts:
+def find_segment_contacts(problem: KinematicProblem, z: Floats) -> SegmentContacts:
     """Find close pairs within segments and express them as contacts at the adjacent waypoints.
 
     Only the deepest sample of each segment and pair counts. See `_transfer_to_waypoints`.
@@ -137,7 +137,7 @@ def find_segment_contacts(problem: TrajectoryProblem, z: Floats) -> SegmentConta
 
 
 def _transfer_to_waypoints(
-    problem: TrajectoryProblem,
+    problem: KinematicProblem,
     contacts: ContactModel,
     path: Floats,
     states: Floats,

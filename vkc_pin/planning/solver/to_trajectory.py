@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from vkc_pin.planning.nlp.kinematic_problem import KinematicProblem
 from vkc_pin.planning.nlp.pose_goals import find_phase_spans
-from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.utils.arrays import Floats, Ints
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 
-def make_trajectory(problem: TrajectoryProblem, z: Floats, dt: Floats) -> Trajectory:
+def make_trajectory(problem: KinematicProblem, z: Floats, dt: Floats) -> Trajectory:
     """Convert z_1..z_N, shape (N, n), with step durations dt, shape (N,) [s], to a trajectory.
 
     It pauses for grasping and releasing.
@@ -26,7 +26,7 @@ def make_trajectory(problem: TrajectoryProblem, z: Floats, dt: Floats) -> Trajec
     return Trajectory(problem.chain.names, times, waypoints[rows], tuple(phases), robot)
 
 
-def _list_rows(problem: TrajectoryProblem) -> tuple[Ints, list[PhaseSpan]]:
+def _list_rows(problem: KinematicProblem) -> tuple[Ints, list[PhaseSpan]]:
     """Return the waypoint of each row of the trajectory, repeated in pauses, and its phases."""
     task = problem.task
     rows = [0]
@@ -44,7 +44,7 @@ def _list_rows(problem: TrajectoryProblem) -> tuple[Ints, list[PhaseSpan]]:
     return np.array(rows), phases
 
 
-def close_chains(problem: TrajectoryProblem, points: Floats, at: Floats) -> Floats:
+def close_chains(problem: KinematicProblem, points: Floats, at: Floats) -> Floats:
     """Close the chain at points between the rows of a trajectory of `make_trajectory`.
 
     Only the arm moves: base and object joints stay, as do points where the arm cannot follow.
@@ -83,7 +83,7 @@ def close_chains(problem: TrajectoryProblem, points: Floats, at: Floats) -> Floa
     return closed
 
 
-def _hold_grasp_coordinates(problem: TrajectoryProblem, waypoints: Floats) -> None:
+def _hold_grasp_coordinates(problem: KinematicProblem, waypoints: Floats) -> None:
     """Set grasp coordinates that are inactive to their next active value, or else their last."""
     for hold, names in problem.chain.virtual.items():
         active = np.zeros(len(waypoints), bool)

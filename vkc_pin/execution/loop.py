@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import coal
 import numpy as np
@@ -178,6 +178,46 @@ class _Settings:
     planner: Planner | None
 
 
+@dataclass
+class _Rest:
+    """What a robot waits for that brakes or stands.
+
+    Attributes:
+        steps: Steps that are left.
+        guess: Motion from which the search for the next one starts.
+        since: When the robot has come to rest [s].
+        attempts: Number of searches so far.
+        timeouts: Number of these that the time limit has ended.
+        overlaps: Links that overlap where the robot stands → how deep [m].
+    """
+
+    steps: tuple[Step, ...]
+    guess: Trajectory
+    since: float = np.inf
+    attempts: int = 0
+    timeouts: int = 0
+    overlaps: dict[tuple[str, str], float] = field(default_factory=dict)
+
+    def begin_again(self, since: float) -> None:
+        """Count the searches from now on, since the robot brakes until then [s]."""
+        self.since = since
+        self.attempts = 0
+        self.timeouts = 0
+
+
+@dataclass
+class _Pull:
+    """Why the hand no longer pulls at the mechanism, until there is a motion to go on.
+
+    Attributes:
+        reason: The finding.
+        is_released: Whether the robot rests where the mechanism has it.
+    """
+
+    reason: str
+    is_released: bool = False
+
+
 class _Loop:
     """State of an execution."""
 
@@ -186,18 +226,11 @@ class _Loop:
         self._robot = robot
         self._settings = settings
         self._joint: JointFinding | None = None  # that the present motion does not account for
-        self._pull = ""  # why a pull ended, until there is a motion to go on
-        self._is_released = False  # whether the robot rests where the mechanism has it
+        self._pull: _Pull | None = None
         self._pulled_to: Floats | None = None  # configuration at the end of the last pull
+        self._rest: _Rest | None = None
         self._cycles = list[Cycle]()
         self._sent = list[tuple[float, Plan]]()
-        # While the robot brakes or stands, the steps that are left, and the motion to guess from.
-        self._waiting: tuple[tuple[Step, ...], Trajectory] | None = None
-        self._rest_since = 0.0
-        self._attempts = 0  # to find a motion from rest
-        self._timeouts = 0  # of these attempts
-        # Links that overlap where the robot stands → how deep [m]
-        self._overlaps = dict[tuple[str, str], float]()
         self._late = 0
 
     def run(self) -> ExecutionResult:
@@ -242,7 +275,7 @@ class _Loop:
             if decision == "stop":
                 return why
             end = float(self._plan.trajectory.times[-1])
-            if self._waiting is None and self._get_motion_time(now) >= end:
+            if self._rest is None and self._get_motion_time(now) >= end:
                 return self._monitor.check_tracking(end, self._robot.read())
             next_cycle = max(next_cycle + self._settings.period, self._robot.time)
 
@@ -313,8 +346,8 @@ class _Loop:
             left = float(plan.trajectory.times[-1]) - self._get_motion_time(now)
             if self._joint is not None and not self._pull and left > self._settings.lead:
                 return self._brake(self._joint.reason, pulls=True)
-        if self._waiting is not None:
-            return self._plan_from_rest(now, self._waiting)
+        if self._rest is not None:
+            return self._plan_from_rest(now, self._rest)
         if min(now, state.time) < begin:
             return "go on", ""  # a motion has been sent that has not begun
         scene = None if self._settings.observe is None else self._look(plan.scene)
@@ -411,20 +444,17 @@ class _Loop:
                 break
             delay *= 2.0  # on a slow machine
         self._robot.send(motion, begin)
-        if self._waiting is None:
+        if self._rest is None:
             try:
                 steps = find_remaining_steps(plan, motion_time)
             except InputError:
                 return "stop", reason
-            self._waiting = (steps, plan.trajectory)
+            self._rest = _Rest(steps, plan.trajectory)
         stop = plan.check_stop(motion, self._look(plan.scene_at(motion_time)))
         self._sent.append((begin, stop))
-        self._rest_since = begin + float(motion.times[-1])
-        self._attempts = 0
-        self._timeouts = 0
+        self._rest.begin_again(begin + float(motion.times[-1]))
         if pulls:
-            self._pull = reason
-            self._is_released = False
+            self._pull = _Pull(reason)
         return "brake", reason
 
     def _find_overload(self, state: RobotState) -> str:
@@ -436,37 +466,25 @@ class _Loop:
             return f"pulls against the mechanism with {torque:.0f} N·m"
         return ""
 
-    def _plan_from_rest(
-        self, now: float, waiting: tuple[tuple[Step, ...], Trajectory]
-    ) -> tuple[Decision, str]:
+    def _plan_from_rest(self, now: float, rest: _Rest) -> tuple[Decision, str]:
         """Plan the remaining steps from where the robot stands, once it does."""
-        if now < self._rest_since:
+        if now < rest.since:
             return "wait", "braking"
-        steps, guess = waiting
-        if now > self._rest_since + self._settings.patience:
-            return "stop", self._pull or "no motion was found from rest"
-        if self._pull and not self._is_released:
+        pull = self._pull
+        if now > rest.since + self._settings.patience:
+            return "stop", pull.reason if pull else "no motion was found from rest"
+        if pull and not pull.is_released:
             self._robot.stop()  # commands that are off the mechanism pull at rest, too
-            self._is_released = True
-            return "wait", self._pull
-        if self._pull and self._joint is None and not self._has_moved_on():
+            pull.is_released = True
+            return "wait", pull.reason
+        if pull and self._joint is None and not self._has_moved_on():
             decision: Decision = "stop" if self._settings.observer is None else "wait"
-            return decision, self._pull
-        end = float(self._plan.trajectory.times[-1])
+            return decision, pull.reason
         try:
-            scene = self._look(self._plan.scene_at(end))
-            if self._joint is not None:
-                scene = self._joint.update(scene)
-            positions = self._robot.read().positions
-            distance = float(np.abs(positions - scene.start).max())
-            if self._pull or distance > self._settings.tracking:
-                scene = scene.with_start(base=positions[:3], arm=positions[3:])
-            for links, depth in self._overlaps.items():
-                scene = scene.with_allowed(*links, -depth)
-            scene = measure_grasps(scene)
+            scene = self._look_from_rest(rest)
             prepared = prepare(
                 scene,
-                steps,
+                rest.steps,
                 options=self._first.options,
                 terms=self._first.terms,
                 planner=self._settings.planner,
@@ -475,24 +493,40 @@ class _Loop:
             return "wait", str(impossible)
         # A search that time has ended is followed by a longer one, with other random numbers.
         first = max(self._settings.time_limit, _FIRST_SEARCH)
-        limit = min(first * 2.0**self._timeouts, max(self._settings.patience, first))
+        limit = min(first * 2.0**rest.timeouts, max(self._settings.patience, first))
         found = prepared.solve(
-            guess=guess, time_limit=limit, seed=self._first.seed + self._attempts, explain=False
+            guess=rest.guess,
+            time_limit=limit,
+            seed=self._first.seed + rest.attempts,
+            explain=False,
         )
-        self._attempts += 1
-        self._timeouts += found.status == "time limit"
+        rest.attempts += 1
+        rest.timeouts += found.status == "time limit"
         if not found.success:
-            self._overlaps |= _find_small_overlaps(found)
+            rest.overlaps |= _find_small_overlaps(found)
             return "wait", found.status
         if not self._send(found):
             return "wait", "blocked meanwhile"
-        self._waiting = None
-        self._overlaps = {}
+        self._rest = None
         self._joint = None  # the new motion accounts for it
-        if self._pull:
-            self._pull = ""
+        if pull:
+            self._pull = None
             self._pulled_to = found.scene.start
         return "replan", "from rest"
+
+    def _look_from_rest(self, rest: _Rest) -> Scene:
+        """Return the present world, in which the robot stands. Raises `InputError`."""
+        end = float(self._plan.trajectory.times[-1])
+        scene = self._look(self._plan.scene_at(end))
+        if self._joint is not None:
+            scene = self._joint.update(scene)
+        positions = self._robot.read().positions
+        distance = float(np.abs(positions - scene.start).max())
+        if self._pull or distance > self._settings.tracking:
+            scene = scene.with_start(base=positions[:3], arm=positions[3:])
+        for links, depth in rest.overlaps.items():
+            scene = scene.with_allowed(*links, -depth)
+        return measure_grasps(scene)
 
     def _has_moved_on(self) -> bool:
         """Return whether the mechanism has moved since the pull before.

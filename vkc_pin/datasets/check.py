@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,8 +29,12 @@ from vkc_pin.simulation.execution import simulate
 from vkc_pin.utils.arguments import check_integer, is_number
 from vkc_pin.utils.arrays import Bools, Ints
 from vkc_pin.utils.parallel import CrashedTask, run_tasks
+from vkc_pin.validation.sights import compute_visibility
 from vkc_pin.validation.validate import validate
 from vkc_pin.world.files.writing import check_inside, check_writable, write_atomically
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.task.steps import Step
+from vkc_pin.world.trajectory.trajectory import Trajectory
 
 # problems in the text
 _LISTED = 20
@@ -245,6 +249,7 @@ def _check_episode(shard: Shard, k: int, recipe: Recipe, robot: str) -> dict[str
     # Of an episode whose scene cannot be read:
     start = motion.positions[0]
     winding: dict[str, int] = {}
+    seen: dict[str, float] = {}
     about: dict[str, Any] = {
         "task": "",
         "room": "",
@@ -257,6 +262,7 @@ def _check_episode(shard: Shard, k: int, recipe: Recipe, robot: str) -> dict[str
         scene = episode.scene()
         start = scene.start
         winding = compute_winding_numbers(scene, motion)
+        seen = compute_seen_shares(recipe, scene, episode.steps, motion)
         about = describe_problem(scene, episode.steps)
         about["variant"] = episode.number % recipe.fields.variants
         report = validate(scene, episode.steps, motion, episode.options, episode.terms)
@@ -280,9 +286,36 @@ def _check_episode(shard: Shard, k: int, recipe: Recipe, robot: str) -> dict[str
     record["start"] = np.asarray(start).round(4).tolist()
     record["waypoints"] = len(motion.times)
     record["way"] = sample_coarse_trajectory(motion)
+    record["seen"] = seen
     record["winding"] = sorted(winding.items())
     record["refused"] = "; ".join(reasons[:_MAX_REASONS])
     return record
+
+
+def compute_seen_shares(
+    recipe: Recipe, scene: Scene, steps: Sequence[Step], motion: Trajectory
+) -> dict[str, float]:
+    """Return camera → share of the samples until the grasp at which it sees what is grasped.
+
+    Empty if it is grasped from the start.
+    """
+    about = describe_problem(scene, steps)
+    name = about["object"]
+    if name in scene.held:
+        return {}
+    closing = float(motion.times[-1])
+    for phase in motion.phases:
+        if any(hold.object == name for hold in phase.holds):
+            closing = float(motion.times[phase.first])
+            break
+    times = sample_times(motion, recipe.fields.rate)
+    times = times[times <= closing]
+    shares = dict[str, float]()
+    for camera in recipe.cameras:
+        target = f"{name}.{about['attachment']}"
+        visible = compute_visibility(scene, motion, camera, target, times)
+        shares[camera.name] = float(visible.mean())
+    return shares
 
 
 def _compare_pixels(

@@ -27,7 +27,8 @@ from vkc_pin.world.scene.hold import Hold
 from vkc_pin.world.scene.scene import START_CLEARANCE, Scene, load_scene
 from vkc_pin.world.task.compiler import compile_task
 from vkc_pin.world.task.steps import Actuate, Grasp, Place, Step
-from vkc_pin.world.task.terms import Term
+from vkc_pin.world.task.terms import Term, trace_terms
+from vkc_pin.world.task.views import prefer_in_view
 
 # random configurations that inverse kinematics brings to the grasp at once
 _BATCH = 48
@@ -248,10 +249,23 @@ def describe_problem(scene: Scene, steps: Sequence[Step]) -> dict[str, Any]:
 def resolve_episode_terms(
     recipe: Recipe, scene: Scene, about: Mapping[str, Any]
 ) -> tuple[Term, ...]:
-    """Return the recipe's terms for an episode; see `Episode.about`."""
-    return resolve_terms(
-        recipe.select_terms(about["task"]), scene, about["object"], about["attachment"]
-    )
+    """Return the recipe's terms for an episode; see `Episode.about`.
+
+    With `look`, these include a cost for each camera that does not look at what is grasped, until
+    it is.
+    """
+    name = about["object"]
+    attachment = about["attachment"]
+    terms = resolve_terms(recipe.select_terms(about["task"]), scene, name, attachment)
+    weight = recipe.fields.look
+    if not weight or name in scene.held:
+        return terms
+    target = f"{name}.{attachment}"
+    views = [
+        prefer_in_view(scene, camera, target, weight=weight, during=f"reach {target}")
+        for camera in recipe.cameras
+    ]
+    return terms + tuple(trace_terms(scene, views))
 
 
 @functools.lru_cache(maxsize=_CACHED_ROOMS)

@@ -351,6 +351,7 @@ class RecipeSchema(Schema):
     rate: Annotated[Positive, Field(ge=0.01, le=1000.0)] = 10.0
     simulate: bool = False
     cameras: Annotated[tuple[CameraSchema, ...], Field(max_length=16)] = ()
+    look: NonNegative = 0.0
     terms: tuple[TermSchema, ...] = ()
 
 
@@ -377,8 +378,8 @@ class Recipe:
         content = self.document
         del content["name"]
         del content["license"]
-        # Datasets of older versions, which knew neither cameras nor terms, can be continued.
-        for name in ("cameras", "terms"):
+        # Datasets of older versions, which did not know these fields, can be continued.
+        for name in ("cameras", "look", "terms"):
             if not content[name]:
                 del content[name]
         text = json.dumps(content, sort_keys=True)
@@ -477,6 +478,9 @@ def _check_fields(document: Document, fields: RecipeSchema) -> None:
         raise document.make_error(
             ("cameras",), "nothing is simulated", expected=expected, got="cameras"
         )
+    if fields.look and not fields.cameras:
+        expected = "`cameras` as well, which look at what is grasped"
+        raise document.make_error(("look",), "nothing looks", expected=expected, got=fields.look)
     with document.annotate_errors(("rooms",)):
         least, most = fields.rooms.clutter
         RoomSettings(clutter=least, width=fields.rooms.width, front=fields.rooms.front)

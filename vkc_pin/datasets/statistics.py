@@ -78,6 +78,7 @@ def make_statistics_page(
         "<h2>Coverage</h2>",
         _make_table_of_coverage(recipe, records),
         histograms,
+        _make_table_of_views(records),
         "<h2>Homotopy classes</h2>",
         _make_table_of_classes(records),
         "<h2>Failed attempts</h2>",
@@ -107,6 +108,24 @@ def _make_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 def _make_row(texts: Sequence[str], tag: str) -> str:
     cells = "".join(f"<{tag}>{html.escape(text)}</{tag}>" for text in texts)
     return f"<tr>{cells}</tr>"
+
+
+def _make_table_of_views(records: Sequence[Mapping[str, Any]]) -> str:
+    """Return a table of the shares of samples at which cameras see what is grasped; "" without."""
+    shares = dict[tuple[str, str], list[float]]()
+    for record in records:
+        for camera, share in record.get("seen", {}).items():
+            shares.setdefault((camera, str(record["task"])), []).append(share)
+    if not shares:
+        return ""
+    rows = []
+    for (camera, task), values in sorted(shares.items()):
+        always = sum(value == 1.0 for value in values)
+        mean = f"{100.0 * float(np.mean(values)):.0f} %"
+        rows.append([camera, task, str(len(values)), mean, str(always)])
+    head = ["camera", "task", "episodes", "samples", "episodes in which it always is"]
+    title = "<h2>Cameras that see what will be grasped, until it is</h2>"
+    return title + _make_table(head, rows)
 
 
 def _make_table_of_counts(field: str, records: Sequence[Mapping[str, Any]]) -> str:

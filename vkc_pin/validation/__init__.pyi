@@ -1,3 +1,4 @@
 from .remaining import RemainingCheck
+from .sights import compute_visibility
 
-__all__ = ["RemainingCheck"]
+__all__ = ["RemainingCheck", "compute_visibility"]

@@ -40,7 +40,7 @@ def _check_constraint(samples: Samples, term: Constraint) -> Iterator[Violation]
     if not len(rows):
         return
     if term.sight is not None:
-        for row, link in find_occlusions(samples, term.sight, rows):
+        for row, link in find_occlusions(samples.world, samples.z, term.sight, rows):
             detail = f"{link} is in front of it"
             yield samples.make_violation("term", term.name, 1.0, "", detail, row=row)
             break

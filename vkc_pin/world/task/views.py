@@ -133,6 +133,22 @@ def prefer_in_view(
     )
 
 
+def make_sight(scene: Scene, camera: Camera, target: Target, *, until: float = 0.0) -> Sight:
+    """Return the line from a camera of the robot to a point; see `Sight`.
+
+    Args:
+        scene: The scene.
+        camera: The camera.
+        target: The point.
+        until: Distance between tool frame and point up to which the line does not count [m].
+
+    Raises:
+        InputError: An argument is invalid.
+        UnknownNameError: The robot lacks the camera's frame, or the scene the target.
+    """
+    return _View.of(scene, camera, target).make_sight(until)
+
+
 @dataclass(frozen=True, eq=False)
 class _View:
     """A camera of a robot and its target.

@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.datasets import SMALL
+from helpers.expected_errors import expect_error
 
 import vkc_pin as vkc
 from vkc_pin.datasets.check import check_dataset
 from vkc_pin.datasets.dataset import Dataset
 from vkc_pin.datasets.generation import generate
-from vkc_pin.datasets.recipe import CAMERAS
+from vkc_pin.datasets.recipe import CAMERAS, load_recipe
 from vkc_pin.simulation import snapshots
 
 h5py = pytest.importorskip("h5py")
@@ -114,3 +115,24 @@ def test_lerobot_layout_has_colour_images(dataset: Dataset) -> None:
             np.testing.assert_allclose(np.ravel(stats[name][key]), of_colours, atol=1.0 / 255.0)
         described = json.loads(table.schema.metadata[b"huggingface"])["info"]["features"]
         assert described[name] == {"_type": "Image"}
+
+
+@pytest.mark.long
+def test_cameras_that_look_see_what_is_grasped_more_often(tmp_path: Path) -> None:
+    """The share of samples until the grasp at which the head sees the handle, on the page, too."""
+    head = {"name": "head", "frame": "base", "position": [0.3, 0, 1.2], "target": [1.5, 0, 0.9]}
+    shares = []
+    for look in (0.0, 0.3):
+        recipe = {**RECIPE, "tasks": ["drive-open"], "cameras": [head], "look": look}
+        made = generate(recipe, 3, tmp_path / f"look_{look}")
+        found = check_dataset(made.folder)
+        assert found.ok, found
+        shares.append([record["seen"]["head"] for record in found.records])
+        assert found.page is not None
+        assert "Cameras that see what will be grasped" in found.page.read_text()
+    assert np.mean(shares[1]) > np.mean(shares[0])
+
+
+def test_nothing_looks_without_cameras() -> None:
+    with expect_error(r"look.*`cameras` as well"):
+        load_recipe({**SMALL, "look": 0.1})

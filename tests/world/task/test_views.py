@@ -7,6 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import coal
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -18,6 +19,7 @@ from hypothesis import strategies as st
 import vkc_pin as vkc
 from vkc_pin.errors import UnknownNameError
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.validation import compute_visibility
 from vkc_pin.world.task.terms import trace_terms
 
 STEPS = [vkc.Actuate("door", {"hinge": 0.6})]
@@ -117,6 +119,48 @@ def test_arm_in_front_of_the_target_is_a_violation() -> None:
         found = check(plan, term)
         texts = [one.detail for one in found.violations]
         assert any("in front of it" in text for text in texts) is is_hidden, texts
+
+
+def is_hidden_by_robot(plan: vkc.Plan, eye: Floats, point: Floats, own: str, time: float) -> bool:
+    """Return whether a small ball on the way from an eye to a point touches another link."""
+    robot = plan.scene.robot
+    way = point - eye
+    length = float(np.linalg.norm(way))
+    ball = coal.Sphere(1e-3)
+    for share in np.arange(0.05, length - 0.1, 2e-3) / length:
+        at = coal.Transform3s(np.eye(3), eye + share * way)
+        for shape in robot.collision.geometryObjects:
+            joint = str(robot.model.names[shape.parentJoint])
+            if joint == own:
+                continue
+            placement = plan.pose(joint, time) * shape.placement
+            other = coal.Transform3s(placement.rotation, placement.translation)
+            answer = coal.CollisionResult()
+            if coal.collide(shape.geometry, other, ball, at, coal.CollisionRequest(), answer):
+                return True
+    return False
+
+
+@pytest.mark.parametrize("camera", [FRONT, WRIST], ids=["front", "wrist"])
+def test_visibility_is_that_of_the_projection_and_of_rays(camera: vkc.Camera) -> None:
+    scene = load_facing_scene()
+    plan = vkc.plan(scene, STEPS)
+    times = np.linspace(0.0, float(plan.trajectory.times[-1]), 25)
+    seen = compute_visibility(scene, plan.trajectory, camera, "door.handle", times)
+    frame = camera.find_frame(scene.robot)
+    joint = scene.robot.model.frames[scene.robot.model.getFrameId(frame)].parentJoint
+    own = str(scene.robot.model.names[joint])
+    attachment = scene.objects["door"].object.attachment("handle")
+    expected = []
+    for time in times:
+        x, y, depth = project(plan, camera, time)
+        is_inside = abs(x) <= 1.0 and abs(y) <= 1.0 and depth >= 0.05
+        eye = (plan.pose(frame, time) * camera.placement).translation
+        handle = plan.pose(f"door.{attachment.link}", time) * attachment.placement
+        hidden = is_inside and is_hidden_by_robot(plan, eye, handle.translation, own, time)
+        expected.append(is_inside and not hidden)
+    assert seen.tolist() == expected
+    assert 0 < seen.sum() < len(seen)
 
 
 @settings(max_examples=60, deadline=None)

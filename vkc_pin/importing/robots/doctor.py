@@ -117,9 +117,8 @@ def doctor(
 
     The examination covers the home configuration (collisions, pairs closer than the margin, the
     floor), pairs of links that no random configuration separates by the margin, the axle of wheels,
-    missing limits,
-    efforts and masses, units, the hand and the bars that it can grasp, and meshes that are far
-    from convex.
+    missing limits, efforts and masses, units, the hand and the bars that it can grasp, and meshes
+    that are far from convex.
 
     Args:
         robot: A robot, or an argument of `load_robot`.

@@ -65,6 +65,12 @@ def _add_scenes(benches: Any) -> None:
     about = "names or robot.yaml files of other robots (default: the robot of the scenes)"
     parser.add_argument("--robots", nargs="+", metavar="ROBOT", help=about)
 
+    about = "plan in a room from maps, clouds and files, beside the one that is described by hand"
+    parser = _add_benchmark(benches, "worlds", about, "worlds")
+    add_count(parser, "--starts", 5, "random starts per source")
+    about = "sources of the room (default: all)"
+    parser.add_argument("--sources", nargs="+", metavar="SOURCE", help=about)
+
     parser = _add_benchmark(benches, "gap", "reach over a table beyond a gap of 0.85 m", "gap")
     add_count(parser, "--trials", 50, "random starts of base and arm")
 

@@ -73,7 +73,7 @@ _NOTICE = 1.0  # [m] from the hand to its grasp at which an object is seen
 _FAR = 1.5  # [m] from a person to the origin of a shape; none is larger
 _BRAKING = 1.5  # [m] from the base's origin at which something may appear
 _DRAWS = 20  # of places
-_FEW = 200_000  # evaluations for a motion round it
+_FEW = {**LIMITS, "max_evaluations": 200_000}  # limits of a motion round it
 _MOVING = 0.02  # [m/s] or [rad/s]; slower, a robot stands, and who walks into it does so himself
 _REACHED = {"m": 0.01, "rad": 0.02}  # accepted miss of a goal, as in `execution`
 _DEEPEST = 1e-3  # [m] of collisions that count as none
@@ -370,7 +370,7 @@ def _choose_axis(scene: Scene, step: Step, rng: np.random.Generator) -> Scene:
     """
     for _ in range(_DRAWS):
         actual = _displace_axis(scene, step, rng)
-        if plan(actual, [step], max_evaluations=_FEW).success:
+        if plan(actual, [step], **_FEW).success:
             return actual
     return scene
 
@@ -493,7 +493,7 @@ def _appear(found: Plan, closing: float, rng: np.random.Generator) -> Disturbanc
         there = found.scene.with_obstacle(_PERSON, [*place, _HEIGHT / 2, 0.0, 0.0, 0.0])
         if validate(there, found.steps, motion, found.options).ok:
             continue  # the motion does not touch it
-        if plan(there, found.steps, max_evaluations=_FEW).success:
+        if plan(there, found.steps, **_FEW).success:
             break
     else:
         appears = math.inf

@@ -319,7 +319,7 @@ def _add_note_on_ending(found: Plan, budget: Budget) -> Plan:
     """Return a plan; if no proof ended its search, with a note on what did."""
     options = {"time limit": "time_limit", "evaluation limit": "max_evaluations"}
     if found.status in options:
-        limit = budget.describe_limit()
+        limit = budget.describe_limit(found.status)
         note = f"the limit of {limit} ended the search; a larger {options[found.status]} goes on"
     elif found.status in ("not converged", "rejected"):
         note = "the search ended after all initial guesses; with a time_limit it goes on until then"

@@ -64,9 +64,12 @@ class Budget:
             return "evaluation limit"
         return "time limit" if self.end_time > deadline else ""
 
-    def describe_limit(self) -> str:
-        """Return the limit of time or evaluations that is reached, as "60 s"."""
-        if self.stop_status == "evaluation limit":
+    def describe_limit(self, status: str) -> str:
+        """Return the limit that a status of `STOP_STATUSES` is about, as "60 s".
+
+        The status may be that of an attempt that has used up its share.
+        """
+        if status == "evaluation limit":
             return f"{self._max_evaluations} evaluations"
         return f"{self._seconds:g} s"
 

@@ -18,6 +18,7 @@ from sphinx.environment import BuildEnvironment
 from sphinx.util.nodes import make_refnode
 
 import vkc_pin as vkc
+from docs.pictures.closed_loop import execute_beside_person
 
 ROOT = Path(__file__).resolve().parents[2]
 START = "docs/index"
@@ -70,7 +71,7 @@ def find_outdated_pages(
 
 
 def films(app: Sphinx, problem: Exception | None) -> None:
-    """Add the animations, one of them planned now, and a page at the root that redirects."""
+    """Add the animations, two of them planned now, and a page at the root that redirects."""
     if problem is not None or app.builder.name != "html":
         return
     folder = Path(app.outdir) / "docs" / "animations"
@@ -82,6 +83,7 @@ def films(app: Sphinx, problem: Exception | None) -> None:
     if not plan.success:
         raise RuntimeError(plan.summary())
     plan.to_html(folder / "door.html")
+    execute_beside_person().to_html(folder / "closed_loop.html")
     (Path(app.outdir) / "index.html").write_text(REDIRECT.format(f"{START}.html"), encoding="utf-8")
 
 

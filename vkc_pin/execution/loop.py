@@ -232,6 +232,7 @@ class _Loop:
         self._cycles = list[Cycle]()
         self._sent = list[tuple[float, Plan]]()
         self._late = 0
+        self._seen = list[tuple[float, Scene]]()
 
     def run(self) -> ExecutionResult:
         state = self._robot.read()
@@ -257,7 +258,13 @@ class _Loop:
             self._robot.stop()
             raise
         return ExecutionResult(
-            self._first, not reason, reason, tuple(self._cycles), tuple(self._sent), self._late
+            self._first,
+            not reason,
+            reason,
+            tuple(self._cycles),
+            tuple(self._sent),
+            self._late,
+            tuple(self._seen),
         )
 
     def _run_cycles(self, next_cycle: float) -> str:
@@ -328,7 +335,12 @@ class _Loop:
 
     def _look(self, scene: Scene) -> Scene:
         """Return a scene with the present placements of objects and obstacles."""
-        return scene if self._settings.observe is None else self._settings.observe(scene)
+        if self._settings.observe is None:
+            return scene
+        seen = self._settings.observe(scene)
+        if not self._seen or seen.obstacle_visual is not self._seen[-1][1].obstacle_visual:
+            self._seen.append((self._robot.time, seen))
+        return seen
 
     def _decide(self, now: float, state: RobotState) -> tuple[Decision, str]:
         begin, plan = self._sent[-1]

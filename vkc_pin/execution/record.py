@@ -8,8 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
+import pinocchio as pin
 
 from vkc_pin.planning.plan import Plan
+from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.phase_span import PhaseSpan
 from vkc_pin.world.trajectory.splicing import MAX_GAP, concatenate_trajectories, extract_times
 from vkc_pin.world.trajectory.trajectory import Trajectory
@@ -25,6 +28,7 @@ is found yet; or giving up."""
 
 _SHORTEST = 1e-6  # [s] of a part of a motion
 _JUMP = 1e-3  # [s] of a jump to the measured state
+_STILL = 1e-9  # [m], [rad] of the displacement of an obstacle that does not move
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,8 @@ class ExecutionResult:
         cycles: All cycles.
         plans: Begin on the robot's clock [s] and plan of all motions that were sent.
         late: Number of cycles, except those at rest, that took longer than their period.
+        seen: Time on the robot's clock [s] and world of all cycles in which the world had changed,
+            and of the first one.
     """
 
     plan: Plan
@@ -65,6 +71,7 @@ class ExecutionResult:
     cycles: tuple[Cycle, ...]
     plans: tuple[tuple[float, Plan], ...]
     late: int
+    seen: tuple[tuple[float, Scene], ...] = ()
 
     def __repr__(self) -> str:
         verdict = "success" if self.success else f"FAILED: {self.reason}"
@@ -130,8 +137,29 @@ class ExecutionResult:
         return replace(last, scene=scene, steps=self.plan.steps, trajectory=self.motion)
 
     def to_html(self, path: str | Path) -> Path:
-        """Write a page that plays `executed`."""
-        return self.executed.to_html(path)
+        """Write a page that plays `executed`, with obstacles where they were seen."""
+        from vkc_pin.visualization.viewer import to_html
+
+        executed = self.executed
+        return to_html(executed, path, moving=self._compute_displacements(executed.scene))
+
+    def _compute_displacements(self, scene: Scene) -> dict[str, tuple[Floats, list[pin.SE3]]]:
+        """Return obstacle that moved → times of `motion` and displacements from a scene's place."""
+        begin = self.plans[0][0]
+        moved = dict[str, tuple[Floats, list[pin.SE3]]]()
+        times = np.array([max(time - begin, 0.0) for time, _ in self.seen])
+        shapes = dict(zip(scene.obstacle_visual_labels, scene.obstacle_visual, strict=True))
+        for name in scene.obstacle_names:
+            shape = shapes.get(name)
+            if shape is None:
+                continue
+            displacements = []
+            for _, world in self.seen:
+                there = dict(zip(world.obstacle_visual_labels, world.obstacle_visual, strict=True))
+                displacements.append(there[name].placement * shape.placement.inverse())
+            if any(not displacement.isIdentity(_STILL) for displacement in displacements):
+                moved[name] = (times, displacements)
+        return moved
 
     def plot(self, path: str | Path | None = None) -> Figure:
         """Plot a top view of `executed`, and the latencies and decisions of all cycles.

@@ -85,6 +85,10 @@ _POINTS_PER_PART = 60
 _meshes: weakref.WeakKeyDictionary[Robot, list[Solid]] = weakref.WeakKeyDictionary()
 
 
+Displacements = Mapping[str, tuple[Floats, Sequence[pin.SE3]]]
+"""Name of an obstacle → times, shape (K,) [s], and its displacement in the world at each."""
+
+
 @dataclass(frozen=True, eq=False)
 class Item:
     """A drawn shape: path in the viewer, joint, placement in its frame, mesh, colour, label."""
@@ -109,6 +113,8 @@ class Drawing:
         world: World of the scene. Default: built from the scene.
         times: Times of the key frames, shape (K,) [s]. Default: as many as necessary.
         beside: Second motion at these times, drawn as a ghost.
+        moving: Obstacle that moves → times, shape (K,) [s], and its displacements from where the
+            scene has it, in the world. Walls are drawn where they are.
     """
 
     def __init__(
@@ -121,12 +127,14 @@ class Drawing:
         world: World | None = None,
         times: Floats | None = None,
         beside: Motion | None = None,
+        moving: Displacements | None = None,
     ) -> None:
         self.viewer = viewer
         self.scene = scene
         self.trajectory = trajectory
         self.report = report
         self.beside = beside
+        self.moving: Displacements = {} if moving is None else moving
         self.world = World(scene) if world is None else world
         self.motion: Motion = sample_motion(self.world, trajectory, times)
         self.room = Room(scene)
@@ -382,6 +390,7 @@ class Drawing:
         else:
             self._animate_joints(movie, self.beside, f"{_BESIDE}/")
         self._animate_collisions(movie)
+        self._animate_obstacles(movie)
         return movie
 
     def _animate_joints(self, movie: Animation, motion: Motion, above: str) -> None:
@@ -413,6 +422,23 @@ class Drawing:
             moments = [v.time for v in collisions if item.label in v.subject.split(" – ")]
             if moments:
                 self._add_clip(movie, f"{item.path}/<object>", [self._make_alarm(item, moments)])
+
+    def _animate_obstacles(self, movie: Animation) -> None:
+        """Move obstacles, whose meshes are drawn where the scene has them."""
+        labels = self.scene.obstacle_visual_labels
+        for shape, label in zip(self.scene.obstacle_visual, labels, strict=True):
+            if label not in self.moving:
+                continue
+            times, displacements = self.moving[label]
+            quaternions = []
+            positions = []
+            for displacement in displacements:
+                quaternions.append(pin.Quaternion(displacement.rotation).coeffs().tolist())
+                positions.append(displacement.translation.tolist())
+            since = (times - self.motion.times[0]).tolist()
+            turns = Track("quaternion", "quaternion", since, quaternions)
+            shifts = Track("position", "vector3", since, positions)
+            self._add_clip(movie, f"room/{shape.name}", [turns, shifts])
 
     def _make_alarm(self, item: Item, moments: list[float]) -> Track:
         """Make a track that colours an item red around `moments` [s]."""

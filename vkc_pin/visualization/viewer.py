@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import meshcat
     import pinocchio as pin
 
-    from vkc_pin.visualization.drawing import Drawing
+    from vkc_pin.visualization.drawing import Displacements, Drawing
 
 
 # Commands of a scene are 1.5 % larger than at level 9, which takes four times as long.
@@ -126,6 +126,7 @@ def to_html(
     path: str | Path,
     *,
     frames: Mapping[str, pin.SE3] | None = None,
+    moving: Displacements | None = None,
 ) -> Path:
     """Write a self-contained web page with the motion of a plan, or a scene.
 
@@ -135,6 +136,8 @@ def to_html(
         plan_or_scene: What to show.
         path: File to write, atomically.
         frames: Frames to draw; see `show`.
+        moving: Obstacle that moves during the motion → times, shape (K,) [s], and its displacements
+            from where the scene has it, in the world.
 
     Returns:
         The path.
@@ -143,7 +146,7 @@ def to_html(
         InputError: Neither a plan nor a scene, or something that cannot be drawn.
     """
     scene, plan = _split(plan_or_scene)
-    page = _make_page(scene, plan, frames)
+    page = _make_page(scene, plan, frames, moving)
     return write_atomically(path, page.encode("utf-8"))
 
 
@@ -254,6 +257,7 @@ def _draw(
     *,
     play: bool = True,
     frames: Mapping[str, pin.SE3] | None = None,
+    moving: Displacements | None = None,
 ) -> Drawing:
     """Draw a scene, and a motion in it, into a viewer."""
     from vkc_pin.visualization.drawing import Drawing
@@ -264,18 +268,22 @@ def _draw(
     if plan is None:
         drawing = Drawing(viewer, scene)
     else:
-        drawing = Drawing(viewer, scene, plan.trajectory, plan.report)
+        drawing = Drawing(viewer, scene, plan.trajectory, plan.report, moving=moving)
     drawing.draw(play=play, frames=placed)
     return drawing
 
 
 def _make_page(
-    scene: Scene, plan: CheckedMotion | None, frames: Mapping[str, pin.SE3] | None = None
+    scene: Scene,
+    plan: CheckedMotion | None,
+    frames: Mapping[str, pin.SE3] | None = None,
+    moving: Displacements | None = None,
 ) -> str:
     import meshcat
 
     recorder = Recorder()
-    drawing = _draw(meshcat.Visualizer(window=recorder), scene, plan, play=False, frames=frames)
+    viewer = meshcat.Visualizer(window=recorder)
+    drawing = _draw(viewer, scene, plan, play=False, frames=frames, moving=moving)
     film = {**_describe_film(scene, plan), "portrait": drawing.find_portrait_position()}
     return render_page(recorder, title=f"{scene.name} – vkc_pin", film=film)
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from vkc_pin import __version__
 
 sys.path.insert(0, str(Path(__file__).parent / "_ext"))
+sys.path.insert(0, str(Path(__file__).parents[1]))  # for `docs.pictures`
 
 project = "vkc_pin"
 author = "the authors of vkc_pin"

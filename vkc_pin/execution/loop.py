@@ -338,8 +338,9 @@ class _Loop:
         if self._settings.observe is None:
             return scene
         seen = self._settings.observe(scene)
-        if not self._seen or seen.obstacle_visual is not self._seen[-1][1].obstacle_visual:
-            self._seen.append((self._robot.time, seen))
+        now = self._robot.time
+        if not self._seen or now > self._seen[-1][0]:
+            self._seen.append((now, seen))
         return seen
 
     def _decide(self, now: float, state: RobotState) -> tuple[Decision, str]:

@@ -61,8 +61,7 @@ class ExecutionResult:
         cycles: All cycles.
         plans: Begin on the robot's clock [s] and plan of all motions that were sent.
         late: Number of cycles, except those at rest, that took longer than their period.
-        seen: Time on the robot's clock [s] and world of all cycles in which the world had changed,
-            and of the first one.
+        seen: Time on the robot's clock [s] and world at each, whenever the loop looked.
     """
 
     plan: Plan
@@ -146,17 +145,16 @@ class ExecutionResult:
     def _compute_displacements(self, scene: Scene) -> dict[str, tuple[Floats, list[pin.SE3]]]:
         """Return obstacle that moved → times of `motion` and displacements from a scene's place."""
         begin = self.plans[0][0]
+        before = [world for time, world in self.seen if time <= begin]
+        worlds = [(0.0, before[-1])] if before else []
+        worlds += [(time - begin, world) for time, world in self.seen if time > begin]
+        times = np.array([time for time, _ in worlds])
         moved = dict[str, tuple[Floats, list[pin.SE3]]]()
-        times = np.array([max(time - begin, 0.0) for time, _ in self.seen])
-        shapes = dict(zip(scene.obstacle_visual_labels, scene.obstacle_visual, strict=True))
-        for name in scene.obstacle_names:
-            shape = shapes.get(name)
-            if shape is None:
-                continue
+        for number, name in enumerate(scene.obstacle_visual_labels):
+            place = scene.obstacle_visual[number].placement
             displacements = []
-            for _, world in self.seen:
-                there = dict(zip(world.obstacle_visual_labels, world.obstacle_visual, strict=True))
-                displacements.append(there[name].placement * shape.placement.inverse())
+            for _, world in worlds:
+                displacements.append(world.obstacle_visual[number].placement * place.inverse())
             if any(not displacement.isIdentity(_STILL) for displacement in displacements):
                 moved[name] = (times, displacements)
         return moved

@@ -7,7 +7,7 @@ follows the motion to 5 mm or 5 mrad, from few numbers per joint and key frame.
 from __future__ import annotations
 
 import weakref
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any
 

@@ -10,7 +10,7 @@ import vkc_pin as vkc
 from docs.pictures import IMAGES
 from vkc_pin.execution import ExecutionResult, IdealRobot, execute
 
-_SPEED = 0.8  # of the person [m/s]
+SPEED = 0.8  # of the person [m/s]
 
 
 def execute_beside_person() -> ExecutionResult:
@@ -21,7 +21,7 @@ def execute_beside_person() -> ExecutionResult:
     crossing = float(plan.trajectory.at(2.0)[0])
 
     def observe(known: vkc.Scene) -> vkc.Scene:
-        place = [crossing, _SPEED * robot.time - 2.5, 0.3, 0.0, 0.0, 0.0]
+        place = [crossing, SPEED * robot.time - 2.5, 0.3, 0.0, 0.0, 0.0]
         return known.with_obstacle("stool", place)
 
     return execute(plan, robot, observe=observe, time_limit=60.0)

@@ -5,12 +5,15 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
+import meshcat
 import numpy as np
 import pytest
 
 import vkc_pin as vkc
-from docs.pictures.closed_loop import execute_beside_person
+from docs.pictures.closed_loop import SPEED, execute_beside_person
 from vkc_pin.execution import Cycle, ExecutionResult
+from vkc_pin.visualization.drawing import Drawing
+from vkc_pin.visualization.viewer import Recorder
 
 
 @cache
@@ -53,6 +56,30 @@ def test_execution_is_shown(tmp_path: Path) -> None:
     result.plot(tmp_path / "plot.png")
     assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
     assert isinstance(result.executed, vkc.Plan)
+
+
+def test_page_moves_the_person_as_it_was_seen() -> None:
+    result = execute_beside_a_person()
+    executed = result.executed
+    ((name, (times, displacements)),) = result._compute_displacements(executed.scene).items()
+    assert name == "stool"
+    assert (np.diff(times) > 0.0).all()
+    number = executed.scene.obstacle_visual_labels.index(name)
+    place = executed.scene.obstacle_visual[number].placement
+    along = [(displacement * place).translation[1] for displacement in displacements]
+    seen = times + result.plans[0][0]
+    np.testing.assert_allclose(along[1:], SPEED * seen[1:] - 2.5, atol=1e-9)
+    recorder = Recorder()
+    viewer = meshcat.Visualizer(window=recorder)
+    moving = {name: (times, displacements)}
+    Drawing(viewer, executed.scene, executed.trajectory, moving=moving).draw()
+    (movie,) = [one for one in recorder.commands if one["type"] == "set_animation"]
+    (clip,) = [one["clip"] for one in movie["animations"] if "room/stool" in one["path"]]
+    (shifts,) = [track for track in clip["tracks"] if track["name"] == ".position"]
+    keys = shifts["keys"]
+    assert len(keys) == len(times)
+    assert keys[-1]["time"] == pytest.approx(times[-1])
+    np.testing.assert_allclose(keys[-1]["value"], displacements[-1].translation)
 
 
 def test_motion_jumps_to_where_the_robot_was_measured() -> None:

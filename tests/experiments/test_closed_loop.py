@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +15,28 @@ from vkc_pin.experiments.closed_loop import ROWS, _disturb
 from vkc_pin.experiments.tasks import TASKS, make_start
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.prepare import plan
+from vkc_pin.simulation.recording import ObjectState
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.scene.estimated_joints import find_axis
+from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.robot_state import RobotState
+
+
+@dataclass
+class Observer:
+    """A robot that sees the drawer where it is in a scene."""
+
+    scene: Scene
+    time: float
+    positions: Floats
+    held: frozenset[str] = frozenset()
+
+    def read(self) -> RobotState:
+        return RobotState(self.time, self.positions, np.zeros_like(self.positions))
+
+    def object_states(self) -> dict[str, ObjectState]:
+        placed = self.scene.objects["drawer"]
+        return {"drawer": ObjectState({"slide": 0.0}, placed.placement)}
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +64,8 @@ def test_object_is_seen_elsewhere_at_last(row: str, drawer_plan: Plan) -> None:
     motion = drawer_plan.trajectory
     end = motion.at(motion.times[-1])[:9]
     for clock, measured, seen in ((0.0, motion.at(0.0)[:9], False), (60.0, end, True)):
-        scene = found.observe(drawer_plan.scene, clock, measured, 0.0)
+        robot: Any = Observer(found.actual, clock, measured)
+        scene = found.observe(drawer_plan.scene, robot)
         assert (scene.objects["drawer"].placement == there) == seen
 
 
@@ -57,7 +81,8 @@ def test_obstacle_is_where_it_is_seen(row: str, drawer_plan: Plan) -> None:
     found = _disturb(row, planned, np.random.default_rng(1))
     assert found.obstacle is not None
     for clock in (0.0, 2.0, 9.0):
-        seen = found.observe(with_person, clock, scene.start, 0.0)
+        robot: Any = Observer(scene, clock, scene.start)
+        seen = found.observe(with_person, robot)
         (shape,) = [one for one in seen.obstacles if one.name == "person"]
         np.testing.assert_allclose(shape.placement.translation, found.obstacle(clock), atol=1e-12)
 

@@ -163,15 +163,17 @@ def format_results(result: Mapping[str, Any]) -> str:
     """Return the tables of a result in Markdown."""
     about = result["meta"]
     records = result["trials"]
-    head = ["row", "task", "plans", "open", "closed", "deepest [mm]", "latency [ms]", "cycles [%]"]
+    figures = ["plans", "open", "closed", "deepest [mm]", "latency [ms]", "cycles [%]"]
+    head = ["row", "task", *figures]
+    summary = []
     rows = []
     for row, name in itertools.product(about["rows"], about["tasks"]):
-        cells = ["does not apply: no joint", *("–" for _ in head[3:])]
+        cells = ["does not apply: no joint", *("–" for _ in figures[1:])]
         if _applies(row, name):
             cells = _summarize(select(records, row=row, task=name))
         rows.append([row, name, *cells])
     for row in about["rows"]:
-        rows.append([row, "all", *_summarize(select(records, row=row))])
+        summary.append([row, *_summarize(select(records, row=row))])
     lines = ["## Trials that failed in the closed loop", ""]
     for record in records:
         if record["success"] and not record.get("closed"):
@@ -187,6 +189,7 @@ def format_results(result: Mapping[str, Any]) -> str:
         "the program computes. Latencies are the median and the 95th percentile of cycles that "
         "planned again; cycles are those that kept 20 Hz.",
         "\n".join(f"- {row}: {ROWS[row]}" for row in about["rows"]),
+        format_table(["what differs", *figures], summary),
         format_table(head, rows),
         "\n".join(lines),
     )

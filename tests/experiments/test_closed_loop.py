@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers.experiments import run_experiment
 
-from vkc_pin.experiments.closed_loop import ROWS, _disturb
+from vkc_pin.experiments.closed_loop import ROWS, _disturb, _Localisation
 from vkc_pin.experiments.tasks import TASKS, make_start
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.prepare import plan
@@ -19,6 +19,7 @@ from vkc_pin.simulation.recording import ObjectState
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.scene.estimated_joints import find_axis
 from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.frames import place_base
 from vkc_pin.world.trajectory.robot_state import RobotState
 
 
@@ -85,6 +86,26 @@ def test_obstacle_is_where_it_is_seen(row: str, drawer_plan: Plan) -> None:
         seen = found.observe(with_person, robot)
         (shape,) = [one for one in seen.obstacles if one.name == "person"]
         np.testing.assert_allclose(shape.placement.translation, found.obstacle(clock), atol=1e-12)
+
+
+def test_robot_is_localised_near_a_landmark_once_it_has_moved(drawer_plan: Plan) -> None:
+    """It is where the corrected frame has it: at its measured place minus the bias."""
+    motion = drawer_plan.trajectory
+    start, end = motion.at(0.0)[:9], motion.at(motion.times[-1])[:9]
+    robot: Any = Observer(drawer_plan.scene, 0.0, start)
+    robot.bias = np.array([0.02, -0.01, 0.017])
+    landmark = drawer_plan.pose(None, float(motion.times[-1])).translation
+    localise = _Localisation(robot, drawer_plan.scene, [landmark])
+    far = motion.at(0.3)[:9]
+    for positions, is_localised in ((start, False), (far, False), (end, True)):
+        robot.positions = positions
+        frame = localise()
+        actual = place_base(frame, positions)[:3]
+        expected = positions[:3] - robot.bias if is_localised else positions[:3]
+        np.testing.assert_allclose(actual, expected, atol=1e-12)
+    # Where it stands, it stays localised as it was.
+    robot.bias = np.zeros(3)
+    np.testing.assert_array_equal(localise(), frame)
 
 
 def test_every_row_is_explained() -> None:

@@ -119,12 +119,13 @@ def make_cloud(folder: Path, spacing: float) -> tuple[Scene, str]:
     # Random points leave gaps of more than their mean distance.
     seen = bare.with_points(sample_points(spacing), radius=spacing)
     counts = seen.point_counts["points"]
-    return seen, f"{counts.kept} points, {counts.removed} removed"
+    removed = sum(counts) - counts.kept
+    return seen, f"{counts.kept} points, {removed} removed"
 
 
 def make_octree(folder: Path) -> tuple[Scene, str]:
     """Plan in an octree of OctoMap that the points fill."""
-    import pyoctomap
+    import pyoctomap  # type: ignore[import-untyped]
 
     tree = pyoctomap.OcTree(_CELL)
     cells = np.unique(np.floor(sample_points(_CELL / 2.0) / _CELL), axis=0)
@@ -136,6 +137,7 @@ def make_octree(folder: Path) -> tuple[Scene, str]:
     document = load_twin().document
     document["obstacles"] = []
     bare = Scene.from_document(document, load_twin().folder)
+    assert read.radius is not None
     seen = bare.with_points(read.points, radius=read.radius)
     return seen, f"{len(read.points)} cells"
 

@@ -96,7 +96,7 @@ class BeamSearch:
         self.routes = routes
         self.for_narrow_passages = for_narrow_passages
         options = self.problem.options
-        self.metric = np.sqrt(self.problem.motion_cost.metric / options.velocity_weight_arm)
+        self.metric = np.sqrt(self.problem.metric / options.velocity_weight_arm)
         self.approaches = dict[int, int]()  # waypoint of a grasp → that of the approach to it
         for phase, first, grasp in find_phase_spans(self.problem.task):
             if phase.grasps:

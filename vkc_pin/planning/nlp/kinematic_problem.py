@@ -26,6 +26,9 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Phase, Task
 from vkc_pin.world.trajectory.wheels import make_rolling_limits
 
+# Relative cost of coordinates that are chosen at the grasp and constant afterwards; it only
+# regularises the problem.
+_CHOSEN_FREEDOM_WEIGHT = 1e-4
 _TOLERANCES = Tolerances()
 
 
@@ -40,6 +43,7 @@ class KinematicProblem:
         rolling: Motion constraints of its base.
         contacts: Collision model of the task.
         ends: Last waypoint of each phase.
+        metric: Weights of squared displacements, shape (n,).
         start: z_0, shape (n,).
         lower, upper: Bounds of z_1..z_N, shape (N, n): joint limits (eq. 4), fixed coordinates,
             joint goals.
@@ -70,6 +74,7 @@ class KinematicProblem:
             PoseSolver(self.chain.tree, goal.row, goal.local, self.cache)
             for goal in self.pose_goals
         )
+        self.metric = self._make_metric()
         self.start = self._make_start()
         self.lower, self.upper = self._make_bounds()
         self.start.setflags(write=False)
@@ -94,6 +99,19 @@ class KinematicProblem:
     def still(self) -> Floats:
         """z_1..z_N of the stationary motion, shape (N, n)."""
         return np.tile(self.start, (self.segments, 1))
+
+    def _make_metric(self) -> Floats:
+        """Return the weights: one for all lengths, those of turns by group of joints."""
+        o = self.options
+        turn_weights = np.full(self.chain.size, o.velocity_weight_object)
+        turn_weights[2] = o.velocity_weight_heading
+        turn_weights[3 : self.chain.robot.coordinates.size] = o.velocity_weight_arm
+        # The displacements of coupled joints add up.
+        turns = self.chain.coordinates.turns
+        lengths = self.chain.coordinates.lengths
+        metric = turn_weights * turns**2 + o.velocity_weight_base * lengths**2
+        metric[[column for column, _, _ in self.choices]] *= _CHOSEN_FREEDOM_WEIGHT
+        return np.asarray(metric)
 
     def _make_start(self) -> Floats:
         """Return z_0: the robot, joints of objects, and freedoms of grasps at the start."""

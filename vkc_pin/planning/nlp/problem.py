@@ -35,9 +35,6 @@ from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.phases import Task
 from vkc_pin.world.task.terms import Term
 
-# Relative cost of coordinates that are chosen at the grasp and constant afterwards; it only
-# regularises the problem.
-_CHOSEN_FREEDOM_WEIGHT = 1e-4
 # [m/s], [rad/s] with which a start velocity may open the closure of a grasped object, as where it
 # is not exactly where the motion was planned. At 1 m/s², such a hand is brought back within 0.5 mm.
 _MAX_CLOSURE_SPEED = 0.03
@@ -106,18 +103,10 @@ class TrajectoryProblem(KinematicProblem):
         )
 
     def _make_motion_cost(self) -> MotionCost:
-        """Return the motion cost: one weight for all lengths, turns weighted by group of joints."""
+        """Return the cost of steps and of their changes."""
         o = self.options
-        turn_weights = np.full(self.chain.size, o.velocity_weight_object)
-        turn_weights[2] = o.velocity_weight_heading
-        turn_weights[3 : self.chain.robot.coordinates.size] = o.velocity_weight_arm
-        # The displacements of coupled joints add up.
-        turns = self.chain.coordinates.turns
-        lengths = self.chain.coordinates.lengths
-        metric = turn_weights * turns**2 + o.velocity_weight_base * lengths**2
-        metric[[column for column, _, _ in self.choices]] *= _CHOSEN_FREEDOM_WEIGHT
         return MotionCost(
-            metric,
+            self.metric,
             o.acceleration_weight / o.dt**2,
             self.ends,
             self.transcription.structure.stops,

@@ -45,8 +45,8 @@ def test_points_are_an_obstacle(scene: vkc.Scene) -> None:
 
 def test_points_of_the_same_name_are_replaced(scene: vkc.Scene) -> None:
     first = scene.with_points(POINTS)
-    second = first.with_points(POINTS[:1]).with_points(POINTS[1:], name="other")
-    assert second.obstacle_names == (*scene.obstacle_names, "points", "other")
+    second = first.with_points(POINTS[:1]).with_points(POINTS[1:], name="camera 2")
+    assert second.obstacle_names == (*scene.obstacle_names, "points", "camera 2")
     np.testing.assert_allclose(collect_points(second), POINTS[:1], atol=1e-6)
 
 
@@ -156,7 +156,7 @@ def test_unknown_frame_is_refused_with_the_nearest(scene: vkc.Scene) -> None:
 
 
 def test_names_of_others_are_refused(scene: vkc.Scene) -> None:
-    for name in ("floor", next(iter(scene.objects)), "a b", ""):
+    for name in ("floor", next(iter(scene.objects)), "a.b", " a", ""):
         with pytest.raises(vkc.InputError, match="name: this name cannot be used"):
             scene.with_points(POINTS, name=name)
 

@@ -77,11 +77,14 @@ Positive = Annotated[Number, _LARGE_ENOUGH]
 NonNegative = Annotated[Number, Field(ge=0.0)]
 Vector3 = Annotated[tuple[Number, Number, Number], require_length(3)]
 _NAME = re.compile(r"[^\s./]([^./]*[^\s./])?")
-_VALID_NAME = require(
-    lambda name: name.isprintable() and _NAME.fullmatch(name),
-    "not a name",
-    "text without '.', '/' or spaces around it",
-)
+
+
+def is_name(text: str) -> bool:
+    """Return whether a text may be the name of an obstacle, an object or a scene."""
+    return text.isprintable() and _NAME.fullmatch(text) is not None
+
+
+_VALID_NAME = require(is_name, "not a name", "text without '.', '/' or spaces around it")
 Name = Annotated[str, _VALID_NAME]
 
 

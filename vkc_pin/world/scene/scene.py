@@ -26,6 +26,7 @@ from vkc_pin.utils.arguments import (
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.utils.notebook import render_card
 from vkc_pin.utils.pickling import freeze
+from vkc_pin.world.files.fields import is_name
 from vkc_pin.world.files.resources import check_path, find_file
 from vkc_pin.world.models.shapes import (
     check_start_value,
@@ -504,12 +505,11 @@ class Scene:
         """Check that measured points can have a name."""
         others = [*self.objects, FLOOR, "robot"]
         others += [one.name for one in self.described.obstacles if one.type != "points"]
-        is_valid = isinstance(name, str) and name.isidentifier()
-        if not is_valid or name in others:
+        if not isinstance(name, str) or not is_name(name) or name in others:
             raise InputError(
                 "this name cannot be used",
                 field="name",
-                expected="an identifier that no object and no other kind of obstacle has",
+                expected="a name that no object and no other kind of obstacle has, without . and /",
                 got=format_value(name),
             )
 

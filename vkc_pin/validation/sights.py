@@ -95,7 +95,7 @@ def find_occlusions(world: World, z: Floats, sight: Sight, rows: Ints) -> Iterat
         direction = (ends[row] - begins[row]) / lengths[row]
         length = float(lengths[row]) - _HOUSING - _SEEN
         middle = begins[row] + direction * (_HOUSING + length / 2.0)
-        line = coal.Capsule(_THICKNESS, length / 2.0)
+        line = coal.Capsule(_THICKNESS, length)
         along = pin.SE3(pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), direction), middle)
         for number, (center, radius) in boxes.items():
             at = pin.SE3(rotations[row, number], origins[row, number])

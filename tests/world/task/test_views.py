@@ -143,7 +143,8 @@ def is_hidden_by_robot(plan: vkc.Plan, eye: Floats, point: Floats, own: str, tim
 @pytest.mark.parametrize("camera", [FRONT, WRIST], ids=["front", "wrist"])
 def test_visibility_is_that_of_the_projection_and_of_rays(camera: vkc.Camera) -> None:
     scene = load_facing_scene()
-    plan = vkc.plan(scene, STEPS)
+    looks = vkc.prefer_in_view(scene, camera, "door.handle", weight=0.3)
+    plan = vkc.plan(scene, STEPS, terms=[looks])
     times = np.linspace(0.0, float(plan.trajectory.times[-1]), 17)
     seen = compute_visibility(scene, plan.trajectory, camera, "door.handle", times)
     frame = camera.find_frame(scene.robot)

@@ -188,12 +188,12 @@ def make_stage(folder: Path) -> tuple[Scene, str]:
 
 SOURCES: Mapping[str, Callable[[Path], tuple[Scene, str]]] = {
     "map": make_map,
-    "cloud, 50 mm": functools.partial(make_cloud, spacing=0.05),
-    "cloud, 20 mm": functools.partial(make_cloud, spacing=0.02),
+    "cloud_50_mm": functools.partial(make_cloud, spacing=0.05),
+    "cloud_20_mm": functools.partial(make_cloud, spacing=0.02),
     "octree": make_octree,
-    "MoveIt .scene": make_planning_scene,
+    "moveit": make_planning_scene,
     "mesh": make_mesh,
-    "USD": make_stage,
+    "usd": make_stage,
 }
 """Name of a source → function that writes it to a folder, and imports it."""
 

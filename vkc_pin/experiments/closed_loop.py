@@ -51,7 +51,7 @@ ROWS: Mapping[str, str] = {
     "nothing": "the world is as planned",
     "displaced": "the object is up to 50 mm and 5° elsewhere, which is noticed at 1 m",
     "obstacle": "an obstacle appears on the path, 1.5 m ahead of the base, with a motion round it",
-    "person": "a person crosses the path of the base at 0.5 to 1 m/s, and is given 0.3 m of room",
+    "person": "a person crosses the path of the base at 0.5 to 1 m/s, and is given 0.6 m of room",
     "localisation": "the base is localised 20 mm and 1° off, and drifts by 5 mm/m and 0.2°/m, "
     "unless the hand is within 1 m of its grasp, or of where its motion ends; plans keep 30 mm of "
     "clearance, and what it touches before it is localised does not count",
@@ -65,8 +65,8 @@ _JOINTLESS = ("household_cup",)
 """Tasks without a joint, to which the row "axis" does not apply."""
 _PERSON = "person"
 _WIDTH = 0.2  # [m], radius of a person and of what appears
-# [m], radius of the room that a person may need before the robot has come to rest: 0.5 s at 0.6 m/s
-_ROOM = 0.5
+# [m], radius of the room that a person may need before the robot has come to rest: 0.6 s at 1 m/s
+_ROOM = 0.8
 _HEIGHT = 1.6  # [m]
 _AWAY = -5.0  # [m], height of an obstacle below the floor, where it touches nothing
 _NOTICE = 1.0  # [m] from the hand to its grasp at which an object is seen

@@ -24,7 +24,8 @@ def execute_beside_person() -> ExecutionResult:
         place = [crossing, SPEED * robot.time - 2.5, 0.3, 0.0, 0.0, 0.0]
         return known.with_obstacle("stool", place)
 
-    return execute(plan, robot, observe=observe, time_limit=60.0)
+    # On a clock that stands still while motions are found, each cycle at rest is a search.
+    return execute(plan, robot, observe=observe, rate=10.0, time_limit=60.0)
 
 
 def make() -> None:

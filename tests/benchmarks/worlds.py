@@ -48,7 +48,7 @@ class Room:
     Attributes:
         scene: The scene, with the start and the door of the one that is described by hand.
         seconds: Time of the import [s].
-        recognised: What was found, in words.
+        recognised: Numbers of obstacles, points or pieces, in words.
     """
 
     scene: Scene
@@ -68,11 +68,22 @@ def list_boxes() -> Iterator[tuple[str, Floats, Floats]]:
         yield item["name"], np.array(item["size"]), np.array(item["position"])
 
 
-def _replace_obstacles(other: Scene) -> Scene:
-    """Return the room with the obstacles of another scene."""
+def _replace_obstacles(obstacles: Sequence[Mapping[str, Any]], folder: Path) -> Scene:
+    """Return the room with other obstacles, whose files are in a folder."""
     document = load_twin().document
-    document["obstacles"] = other.document["obstacles"]
-    return Scene.from_document(document, other.folder)
+    document["obstacles"] = obstacles
+    return Scene.from_document(document, folder)
+
+
+def _make_bare_room() -> Scene:
+    """Return the room without walls and blocks."""
+    return _replace_obstacles([], load_twin().folder)
+
+
+def _import_room(file: Path) -> tuple[Scene, Scene]:
+    """Return the room with the obstacles of a file, and the imported home."""
+    home = import_home(file, file.parent / "imported").scene
+    return _replace_obstacles(home.document["obstacles"], home.folder), home
 
 
 def make_map(folder: Path) -> tuple[Scene, str]:
@@ -92,11 +103,8 @@ def make_map(folder: Path) -> tuple[Scene, str]:
         f"image: map.pgm\nresolution: {_CELL}\norigin: [{low[0]}, {low[1]}, 0.0]\n"
         "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.25\n"
     )
-    document = load_twin().document
-    document["obstacles"] = []
-    bare = Scene.from_document(document, load_twin().folder)
     height = max(size[2] for _, size, _ in list_boxes())
-    on_map = bare.with_map(folder / "map.yaml", height=float(height))
+    on_map = _make_bare_room().with_map(folder / "map.yaml", height=float(height))
     return on_map, f"{len(on_map.obstacles) - 1} boxes"
 
 
@@ -111,13 +119,10 @@ def sample_points(spacing: float) -> Floats:
     return np.concatenate(found)
 
 
-def make_cloud(folder: Path, spacing: float) -> tuple[Scene, str]:
+def make_cloud(_: Path, spacing: float) -> tuple[Scene, str]:
     """Plan among points on the surfaces, as depth cameras measure them."""
-    document = load_twin().document
-    document["obstacles"] = []
-    bare = Scene.from_document(document, load_twin().folder)
     # Random points leave gaps of more than their mean distance.
-    seen = bare.with_points(sample_points(spacing), radius=spacing)
+    seen = _make_bare_room().with_points(sample_points(spacing), radius=spacing)
     counts = seen.point_counts["points"]
     removed = sum(counts) - counts.kept
     return seen, f"{counts.kept} points, {removed} removed"
@@ -134,11 +139,8 @@ def make_octree(folder: Path) -> tuple[Scene, str]:
     tree.updateInnerOccupancy()
     tree.writeBinary(str(folder / "room.bt"))
     read = vkc.read_points(folder / "room.bt")
-    document = load_twin().document
-    document["obstacles"] = []
-    bare = Scene.from_document(document, load_twin().folder)
     assert read.radius is not None
-    seen = bare.with_points(read.points, radius=read.radius)
+    seen = _make_bare_room().with_points(read.points, radius=read.radius)
     return seen, f"{len(read.points)} cells"
 
 
@@ -150,8 +152,8 @@ def make_planning_scene(folder: Path) -> tuple[Scene, str]:
         lines += [f"* {name}", numbers[0], "0 0 0 1", "1", "box", numbers[1]]
         lines += ["0 0 0", "0 0 0 1", "0 0 0 0", "0"]
     (folder / "room.scene").write_text("\n".join([*lines, ".", ""]))
-    home = import_home(folder / "room.scene", folder / "imported")
-    return _replace_obstacles(home.scene), f"{len(home.scene.obstacle_names)} obstacles"
+    room, home = _import_room(folder / "room.scene")
+    return room, f"{len(home.obstacle_names)} obstacles"
 
 
 def make_mesh(folder: Path) -> tuple[Scene, str]:
@@ -162,9 +164,8 @@ def make_mesh(folder: Path) -> tuple[Scene, str]:
         parts.append(box.subdivide_to_size(0.4))
     mesh = trimesh.util.concatenate(parts)
     mesh.export(folder / "room.ply")
-    home = import_home(folder / "room.ply", folder / "imported")
-    pieces = len(home.scene.obstacles)
-    return _replace_obstacles(home.scene), f"{pieces} pieces of {len(mesh.faces)} triangles"
+    room, home = _import_room(folder / "room.ply")
+    return room, f"{len(home.obstacles)} pieces of {len(mesh.faces)} triangles"
 
 
 def make_stage(folder: Path) -> tuple[Scene, str]:
@@ -182,8 +183,8 @@ def make_stage(folder: Path) -> tuple[Scene, str]:
         place.SetScale(Gf.Vec3f(*size.tolist()))
         UsdPhysics.CollisionAPI.Apply(cube.GetPrim())
     stage.GetRootLayer().Save()
-    home = import_home(folder / "room.usda", folder / "imported")
-    return _replace_obstacles(home.scene), f"{len(home.scene.obstacle_names)} obstacles"
+    room, home = _import_room(folder / "room.usda")
+    return room, f"{len(home.obstacle_names)} obstacles"
 
 
 SOURCES: Mapping[str, Callable[[Path], tuple[Scene, str]]] = {
@@ -201,10 +202,10 @@ SOURCES: Mapping[str, Callable[[Path], tuple[Scene, str]]] = {
 @functools.cache
 def make_room(source: str) -> Room:
     """Return the room as a source has it; once per process."""
-    folder = Path(tempfile.mkdtemp(prefix="vkc_pin_worlds_"))
-    began = time.perf_counter()
-    scene, recognised = SOURCES[source](folder)
-    return Room(scene, time.perf_counter() - began, recognised)
+    with tempfile.TemporaryDirectory() as folder:
+        began = time.perf_counter()
+        scene, recognised = SOURCES[source](Path(folder))
+        return Room(scene, time.perf_counter() - began, recognised)
 
 
 def run(

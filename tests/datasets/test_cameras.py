@@ -118,8 +118,8 @@ def test_lerobot_layout_has_colour_images(dataset: Dataset) -> None:
 
 
 @pytest.mark.long
-def test_cameras_that_look_see_what_is_grasped_more_often(tmp_path: Path) -> None:
-    """The share of samples until the grasp at which the head sees the handle, on the page, too."""
+def test_cameras_that_look_see_the_attachment_more_often(tmp_path: Path) -> None:
+    """The statistics state the share of samples until the grasp at which the head sees it."""
     head = {"name": "head", "frame": "base", "position": [0.3, 0, 1.2], "target": [1.5, 0, 0.9]}
     shares = []
     for look in (0.0, 0.3):
@@ -129,7 +129,7 @@ def test_cameras_that_look_see_what_is_grasped_more_often(tmp_path: Path) -> Non
         assert found.ok, found
         shares.append([record["seen"]["head"] for record in found.records])
         assert found.page is not None
-        assert "Cameras that see what will be grasped" in found.page.read_text()
+        assert "cameras see the attachment" in found.page.read_text()
     assert np.mean(shares[1]) > np.mean(shares[0])
 
 

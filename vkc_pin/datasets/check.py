@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,6 @@ from vkc_pin.validation.sights import compute_visibility
 from vkc_pin.validation.validate import validate
 from vkc_pin.world.files.writing import check_inside, check_writable, write_atomically
 from vkc_pin.world.scene.scene import Scene
-from vkc_pin.world.task.steps import Step
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 # problems in the text
@@ -262,8 +261,8 @@ def _check_episode(shard: Shard, k: int, recipe: Recipe, robot: str) -> dict[str
         scene = episode.scene()
         start = scene.start
         winding = compute_winding_numbers(scene, motion)
-        seen = compute_seen_shares(recipe, scene, episode.steps, motion)
         about = describe_problem(scene, episode.steps)
+        seen = compute_seen_shares(recipe, scene, about, motion)
         about["variant"] = episode.number % recipe.fields.variants
         report = validate(scene, episode.steps, motion, episode.options, episode.terms)
         reasons += [str(violation) for violation in report.violations]
@@ -293,15 +292,20 @@ def _check_episode(shard: Shard, k: int, recipe: Recipe, robot: str) -> dict[str
 
 
 def compute_seen_shares(
-    recipe: Recipe, scene: Scene, steps: Sequence[Step], motion: Trajectory
+    recipe: Recipe, scene: Scene, about: Mapping[str, Any], motion: Trajectory
 ) -> dict[str, float]:
-    """Return camera → share of the samples until the grasp at which it sees what is grasped.
+    """Return camera → share of the samples until the grasp at which it sees the attachment.
 
-    Empty if it is grasped from the start.
+    Empty if the object is grasped from the start.
+
+    Args:
+        recipe: Recipe with the cameras.
+        scene: Scene of the episode.
+        about: See `Episode.about`.
+        motion: Motion of the episode.
     """
-    about = describe_problem(scene, steps)
     name = about["object"]
-    if name in scene.held:
+    if not recipe.cameras or name in scene.held:
         return {}
     closing = float(motion.times[-1])
     for phase in motion.phases:
@@ -310,9 +314,9 @@ def compute_seen_shares(
             break
     times = sample_times(motion, recipe.fields.rate)
     times = times[times <= closing]
+    target = f"{name}.{about['attachment']}"
     shares = dict[str, float]()
     for camera in recipe.cameras:
-        target = f"{name}.{about['attachment']}"
         visible = compute_visibility(scene, motion, camera, target, times)
         shares[camera.name] = float(visible.mean())
     return shares

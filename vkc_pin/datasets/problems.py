@@ -251,8 +251,7 @@ def resolve_episode_terms(
 ) -> tuple[Term, ...]:
     """Return the recipe's terms for an episode; see `Episode.about`.
 
-    With `look`, these include a cost for each camera that does not look at what is grasped, until
-    it is.
+    With `look`, each camera prefers to look at the attachment until it is grasped.
     """
     name = about["object"]
     attachment = about["attachment"]
@@ -261,11 +260,11 @@ def resolve_episode_terms(
     if not weight or name in scene.held:
         return terms
     target = f"{name}.{attachment}"
-    views = [
-        prefer_in_view(scene, camera, target, weight=weight, during=f"reach {target}")
-        for camera in recipe.cameras
-    ]
-    return terms + tuple(trace_terms(scene, views))
+    views = list[Term]()
+    for camera in recipe.cameras:
+        term = prefer_in_view(scene, camera, target, weight=weight, during=f"reach {target}")
+        views.append(term)
+    return terms + trace_terms(scene, views)
 
 
 @functools.lru_cache(maxsize=_CACHED_ROOMS)

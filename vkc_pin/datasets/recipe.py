@@ -479,7 +479,7 @@ def _check_fields(document: Document, fields: RecipeSchema) -> None:
             ("cameras",), "nothing is simulated", expected=expected, got="cameras"
         )
     if fields.look and not fields.cameras:
-        expected = "`cameras` as well, which look at what is grasped"
+        expected = "`cameras` as well, which look at the attachment"
         raise document.make_error(("look",), "nothing looks", expected=expected, got=fields.look)
     with document.annotate_errors(("rooms",)):
         least, most = fields.rooms.clutter

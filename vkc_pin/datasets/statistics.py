@@ -111,7 +111,7 @@ def _make_row(texts: Sequence[str], tag: str) -> str:
 
 
 def _make_table_of_views(records: Sequence[Mapping[str, Any]]) -> str:
-    """Return a table of the shares of samples at which cameras see what is grasped; "" without."""
+    """Return a table of how often cameras see the attachment; "" without cameras."""
     shares = dict[tuple[str, str], list[float]]()
     for record in records:
         for camera, share in record.get("seen", {}).items():
@@ -123,8 +123,8 @@ def _make_table_of_views(records: Sequence[Mapping[str, Any]]) -> str:
         always = sum(value == 1.0 for value in values)
         mean = f"{100.0 * float(np.mean(values)):.0f} %"
         rows.append([camera, task, str(len(values)), mean, str(always)])
-    head = ["camera", "task", "episodes", "samples", "episodes in which it always is"]
-    title = "<h2>Cameras that see what will be grasped, until it is</h2>"
+    head = ["camera", "task", "episodes", "samples", "episodes with all samples"]
+    title = "<h2>Samples until the grasp in which cameras see the attachment</h2>"
     return title + _make_table(head, rows)
 
 

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import operator
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import coal
 import numpy as np
+import pinocchio as pin
 
 from vkc_pin.errors import InputError, format_value
 from vkc_pin.execution.joint_observer import JointFinding, JointObserver, ObserveLink
 from vkc_pin.execution.monitor import Monitor
 from vkc_pin.execution.record import Cycle, Decision, ExecutionResult
-from vkc_pin.execution.robots import Robot, RobotState
+from vkc_pin.execution.robots import Robot, RobotState, send_soon
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner
 from vkc_pin.planning.prepare import prepare
@@ -33,7 +35,6 @@ Observe = Callable[[Scene], Scene]
 _STALE = 0.5  # [s], age of a measured state with which no robot is moved on
 _REHEARSAL = 10.0  # [s], limit of a plan that is made before the robot moves
 _FIRST_SEARCH = 0.5  # [s] of the first search from rest
-_BRAKE_DELAY = 0.02  # [s] from the decision to brake to its begin, for sending the motion
 
 
 def execute(  # noqa: PLR0913 - keyword options of a public call
@@ -180,10 +181,10 @@ class _Settings:
 
 @dataclass
 class _Rest:
-    """What a robot waits for that brakes or stands.
+    """State of a robot that brakes or stands until a motion is found.
 
     Attributes:
-        steps: Steps that are left.
+        steps: Remaining steps.
         guess: Motion from which the search for the next one starts.
         since: When the robot has come to rest [s].
         attempts: Number of searches so far.
@@ -232,7 +233,7 @@ class _Loop:
         self._cycles = list[Cycle]()
         self._sent = list[tuple[float, Plan]]()
         self._late = 0
-        self._seen = list[tuple[float, Scene]]()
+        self._seen = list[tuple[float, tuple[pin.GeometryObject, ...]]]()
 
     def run(self) -> ExecutionResult:
         state = self._robot.read()
@@ -326,9 +327,9 @@ class _Loop:
         return True
 
     def _find_blockage(self, plan: Plan, monitor: Monitor) -> str:
-        """Return what blocks a motion that has not begun, in the world as it is now; "" if nothing.
+        """Return the obstacle that blocks a motion in the present world; "" if none does.
 
-        Planning takes time, in which others move on.
+        The world may have changed while the motion was planned.
         """
         scene = None if self._settings.observe is None else self._look(plan.scene)
         return monitor.check_world(float(plan.trajectory.times[0]), scene)[0]
@@ -338,9 +339,10 @@ class _Loop:
         if self._settings.observe is None:
             return scene
         seen = self._settings.observe(scene)
-        now = self._robot.time
-        if not self._seen or now > self._seen[-1][0]:
-            self._seen.append((now, seen))
+        shapes = seen.obstacle_visual
+        before = self._seen[-1][1] if self._seen else ()
+        if len(shapes) != len(before) or any(map(operator.is_not, shapes, before)):
+            self._seen.append((self._robot.time, shapes))
         return seen
 
     def _decide(self, now: float, state: RobotState) -> tuple[Decision, str]:
@@ -441,11 +443,10 @@ class _Loop:
             measured = self._get_motion_time(state.time)
             error = state.positions - plan.trajectory.at(measured)[:size]
             error_rate = state.velocities - plan.trajectory.velocity(measured)[:size]
-        delay = _BRAKE_DELAY
-        while True:
-            begin = self._robot.time + delay
+
+        def brake_from(begin: float) -> Trajectory:
             motion_time = self._get_motion_time(begin)
-            motion = brake(
+            return brake(
                 plan.scene,
                 plan.trajectory,
                 motion_time,
@@ -453,10 +454,11 @@ class _Loop:
                 error=error + error_rate * (motion_time - measured),
                 error_rate=error_rate,
             )
-            if self._robot.time < begin:
-                break
-            delay *= 2.0  # on a slow machine
-        self._robot.send(motion, begin)
+
+        sent = send_soon(self._robot, brake_from)
+        assert sent is not None  # it always brakes
+        begin, motion = sent
+        motion_time = self._get_motion_time(begin)
         if self._rest is None:
             try:
                 steps = find_remaining_steps(plan, motion_time)
@@ -555,8 +557,8 @@ class _Loop:
 def _find_small_overlaps(failed: Plan) -> dict[tuple[str, str], float]:
     """Return the links that overlap at the start of a failed plan → depth to allow [m].
 
-    What is seen while the robot brakes may be a little where the hand already is. Where anything
-    overlaps deeper than by an error of the model, nothing is allowed.
+    An object that is first seen while the robot brakes may overlap it a little. If any overlap is
+    deeper than an error of the model, none is allowed.
     """
     overlaps = dict[tuple[str, str], float]()
     for violation in failed.report.violations:

@@ -61,7 +61,8 @@ class ExecutionResult:
         cycles: All cycles.
         plans: Begin on the robot's clock [s] and plan of all motions that were sent.
         late: Number of cycles, except those at rest, that took longer than their period.
-        seen: Time on the robot's clock [s] and world at each, whenever the loop looked.
+        seen: Times on the robot's clock [s] at which obstacles had moved, and shapes of all
+            obstacles then, as `Scene.obstacle_visual`.
     """
 
     plan: Plan
@@ -70,7 +71,7 @@ class ExecutionResult:
     cycles: tuple[Cycle, ...]
     plans: tuple[tuple[float, Plan], ...]
     late: int
-    seen: tuple[tuple[float, Scene], ...] = ()
+    seen: tuple[tuple[float, tuple[pin.GeometryObject, ...]], ...] = ()
 
     def __repr__(self) -> str:
         verdict = "success" if self.success else f"FAILED: {self.reason}"
@@ -145,18 +146,18 @@ class ExecutionResult:
     def _compute_displacements(self, scene: Scene) -> dict[str, tuple[Floats, list[pin.SE3]]]:
         """Return obstacle that moved → times of `motion` and displacements from a scene's place."""
         begin = self.plans[0][0]
-        before = [world for time, world in self.seen if time <= begin]
-        worlds = [(0.0, before[-1])] if before else []
-        worlds += [(time - begin, world) for time, world in self.seen if time > begin]
-        times = np.array([time for time, _ in worlds])
+        placements = dict[str, dict[float, pin.SE3]]()  # by shape and time
+        for clock, shapes in self.seen:
+            for shape in shapes:
+                # Of several before the begin, and of several at once, the last one counts.
+                time = max(clock - begin, 0.0)
+                placements.setdefault(shape.name, {})[time] = shape.placement
         moved = dict[str, tuple[Floats, list[pin.SE3]]]()
-        for number, name in enumerate(scene.obstacle_visual_labels):
-            place = scene.obstacle_visual[number].placement
-            displacements = []
-            for _, world in worlds:
-                displacements.append(world.obstacle_visual[number].placement * place.inverse())
+        for name, shape in zip(scene.obstacle_visual_labels, scene.obstacle_visual, strict=True):
+            own = placements.get(shape.name, {})
+            displacements = [placement * shape.placement.inverse() for placement in own.values()]
             if any(not displacement.isIdentity(_STILL) for displacement in displacements):
-                moved[name] = (times, displacements)
+                moved[name] = (np.array(list(own)), displacements)
         return moved
 
     def plot(self, path: str | Path | None = None) -> Figure:

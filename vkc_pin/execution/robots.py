@@ -19,7 +19,8 @@ from vkc_pin.world.trajectory.robot_state import RobotState as RobotState
 from vkc_pin.world.trajectory.splicing import extract_times
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
-_SENDING_TIME = 0.01  # [s] to send a motion, until it begins
+_SENDING_TIME = 0.02  # [s] from the decision to send a motion to its begin
+_SHORTEST = 0.01  # [s] of a motion that is worth correcting
 _ROUNDING = 1e-6  # [m], [rad] of a correction that is none
 
 
@@ -119,8 +120,8 @@ class LocalisedRobot:
     """A robot that drives by its odometry, and is localised in the scene meanwhile.
 
     States are read in the frame of the scene, and motions are sent in that of the odometry, as it
-    lies in the scene when they are sent. Small corrections of the localisation are followed: what
-    is left of the motion is sent again. After larger ones the robot is off its motion, and
+    lies in the scene when they are sent. Small corrections of the localisation are followed: the
+    rest of the motion is sent again. After larger ones the robot is off its motion, and
     `execute` plans again from where it is, if its `tracking` is no larger than `step`.
 
     In terms of ROS (REP 105), the scene is "map", and the odometry's frame "odom".
@@ -184,25 +185,23 @@ class LocalisedRobot:
             self._follow(*self._sent)
 
     def _follow(self, begin: float, motion: Trajectory, sent: Floats) -> None:
-        """Send what is left of a motion again, if the odometry's frame is not where it was."""
+        """Send the rest of a motion again if the odometry's frame has moved."""
         frame = self._read_frame()
         first, last = motion.times[[0, -1]].tolist()
-        delay = _SENDING_TIME
-        while True:
-            start = self._robot.time + delay
+
+        def correct(start: float) -> Trajectory | None:
+            """Return the corrected rest from a time on; None if there is nothing to correct."""
             at = first + start - begin
-            if not first < at < last - delay:
-                return  # a motion that has not begun follows the one before it
+            if not first < at < last - _SHORTEST:
+                return None  # a motion that has not begun follows the one before it
             base = motion.at(at)[:3]
             correction = place_base(frame, place_base(invert_frame(sent), base)) - base
             if not _ROUNDING < np.abs(correction).max() <= self._step:
-                return
-            rest = place_motion(invert_frame(frame), extract_times(motion, at, last))
-            if self._robot.time < start:
-                break
-            delay *= 2.0  # on a slow machine
-        self._robot.send(rest, start)
-        self._sent = begin, motion, frame
+                return None
+            return place_motion(invert_frame(frame), extract_times(motion, at, last))
+
+        if send_soon(self._robot, correct) is not None:
+            self._sent = begin, motion, frame
 
     def _read_frame(self) -> Floats:
         """Return the frame of the odometry in the scene now: x, y [m], yaw [rad]."""
@@ -211,3 +210,27 @@ class LocalisedRobot:
             expected, got = "x, y [m], yaw [rad]", format_value(frame.tolist())
             raise InputError("wrong shape", field="locate()", expected=expected, got=got)
         return frame
+
+
+def send_soon(
+    robot: Robot, make_motion: Callable[[float], Trajectory | None]
+) -> tuple[float, Trajectory] | None:
+    """Send a motion that depends on when it begins; on a slow machine, it begins later.
+
+    Args:
+        robot: The robot.
+        make_motion: Returns the motion for a begin on the robot's clock [s], or None for none.
+
+    Returns:
+        Its begin [s] and the motion; None if there is none.
+    """
+    delay = _SENDING_TIME
+    while True:
+        begin = robot.time + delay
+        motion = make_motion(begin)
+        if motion is None:
+            return None
+        if robot.time < begin:
+            robot.send(motion, begin)
+            return begin, motion
+        delay *= 2.0

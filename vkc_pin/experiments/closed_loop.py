@@ -54,7 +54,7 @@ ROWS: Mapping[str, str] = {
     "person": "a person crosses the path of the base at 0.5 to 1 m/s, and is given 0.6 m of room",
     "localisation": "the base is localised 20 mm and 1° off, and drifts by 5 mm/m and 0.2°/m, "
     "unless the hand is within 1 m of its grasp, or of where its motion ends; plans keep 30 mm of "
-    "clearance, and what it touches before it is localised does not count",
+    "clearance, and contacts before it is localised do not count",
     "grasp": "the hand closes up to 8 mm and 3° off, which is noticed then",
     "axis": "the hinge's axis or slide's direction is up to 30 mm and 5° elsewhere, the handle is "
     "not; a camera sees the grasped link with 1 mm and 0.3° of noise",
@@ -83,8 +83,7 @@ _LINK_NOISE = (0.001, float(np.radians(0.3)))  # of a camera: position [m] and r
 # Limits of a pull: a third of the load that breaks a grasp, three times that of an undisturbed one
 _FORCE_LIMIT = 93.0  # [N]
 _TORQUE_LIMIT = 10.0  # [N·m]
-_TRACKING = 0.008  # [m], [rad]; twice what the servos are off undisturbed
-_CLEARANCE = Options().dist_safe  # [m]
+_TRACKING = 0.008  # [m], [rad]; six times the servos' largest error in undisturbed motions
 _UNCERTAIN_CLEARANCE = 0.03  # [m], that starts have
 _UPDATE = 0.05  # [m] of travel between two corrections of the localisation
 
@@ -220,8 +219,9 @@ def _record(spec: dict[str, Any]) -> dict[str, Any]:
     rng = np.random.default_rng([seed, list(ROWS).index(row), spec["number"]])
     radius = _ROOM if row == "person" else _WIDTH
     start = _add_person(make_start(spec["task"], seed, spec["number"]), radius)
-    keeps = Options(dist_safe=_UNCERTAIN_CLEARANCE if row == "localisation" else _CLEARANCE)
-    found = plan(start, ALL[spec["task"]].steps, options=keeps, seed=seed, **LIMITS)
+    is_mislocalised = row == "localisation"
+    limits = Options(dist_safe=_UNCERTAIN_CLEARANCE) if is_mislocalised else Options()
+    found = plan(start, ALL[spec["task"]].steps, options=limits, seed=seed, **LIMITS)
     fields: dict[str, Any] = {"row": row, "task": spec["task"], "number": spec["number"]}
     if not found.success:
         return trial(found, method="VKC", seed=seed, **fields)
@@ -229,7 +229,7 @@ def _record(spec: dict[str, Any]) -> dict[str, Any]:
     robot = _make_robot(found, disturbance, spec)
     robot.send(found.trajectory, 0.05)
     robot.wait(0.05 + float(found.trajectory.times[-1]) + 1.0)
-    knows_from = math.inf if row == "localisation" else 0.0
+    knows_from = math.inf if is_mislocalised else 0.0
     fields |= _judge("open", found, robot, disturbance, knows_from=knows_from)
 
     robot = _make_robot(found, disturbance, spec)
@@ -246,13 +246,14 @@ def _record(spec: dict[str, Any]) -> dict[str, Any]:
             "torque_limit": _TORQUE_LIMIT,
         }
     driver: Robot = robot
-    localise = _Localisation(robot, found.scene, disturbance.landmarks)
-    if row == "localisation":
+    if is_mislocalised:
+        localise = _Localisation(robot, found.scene, disturbance.landmarks)
         driver = LocalisedRobot(robot, localise, step=_TRACKING)
         options = {"tracking": _TRACKING}
     result = execute(found, driver, observe=observe, **options)
     robot.wait(robot.time + 1.0)
-    knows_from = localise.since if row == "localisation" else 0.0
+    if is_mislocalised:
+        knows_from = localise.since
     fields |= _judge("closed", found, robot, disturbance, result, knows_from=knows_from)
     fields |= {
         "decisions": result.count_decisions(),
@@ -295,31 +296,29 @@ def _disturb(row: str, found: Plan, rng: np.random.Generator) -> Disturbance:
     name = step.object
     closing = float(found.trajectory.times[found.trajectory.phases[0].last])
     at_grasp = found.pose(None, closing).translation
-    if row in ("displaced", "grasp"):
-        largest, turn = (0.05, 5.0) if row == "displaced" else (0.008, 3.0)
-        about = at_grasp if row == "grasp" else scene.objects[name].placement.translation
-        actual = _displace(scene, name, largest, np.radians(turn), about, rng)
 
-        def see(known: Scene, robot: SimulatedRobot) -> Scene:
-            is_seen = _is_near(scene, robot.read().positions, at_grasp)
-            if row == "grasp":
-                is_seen = robot.time > closing + found.options.grasp_time
-            return _see_object(known, name, robot) if is_seen else known
+    def see_from_near(known: Scene, robot: SimulatedRobot) -> Scene:
+        is_near = _is_near(scene, robot.read().positions, at_grasp)
+        return _see_object(known, name, robot) if is_near else known
 
-        return Disturbance(actual, see)
+    def see_in_hand(known: Scene, robot: SimulatedRobot) -> Scene:
+        is_closed = robot.time > closing + found.options.grasp_time
+        return _see_object(known, name, robot) if is_closed else known
+
+    if row == "displaced":
+        at = scene.objects[name].placement.translation
+        return Disturbance(_displace(scene, name, 0.05, np.radians(5.0), at, rng), see_from_near)
+    if row == "grasp":
+        actual = _displace(scene, name, 0.008, np.radians(3.0), at_grasp, rng)
+        return Disturbance(actual, see_in_hand)
     if row == "localisation":
         angle = rng.uniform(0.0, 2.0 * np.pi)
         signs = rng.choice([-1.0, 1.0], 2)
         offset = (0.02 * np.cos(angle), 0.02 * np.sin(angle), np.radians(1.0) * signs[0])
         drift = (0.005 * np.cos(angle), 0.005 * np.sin(angle), np.radians(0.2) * signs[1])
         at_end = found.pose(None, float(found.trajectory.times[-1])).translation
-
-        def look(known: Scene, robot: SimulatedRobot) -> Scene:
-            is_seen = _is_near(scene, robot.read().positions, at_grasp)
-            return _see_object(known, name, robot) if is_seen else known
-
         landmarks = (at_grasp, at_end)
-        return Disturbance(scene, look, offset=offset, drift=drift, landmarks=landmarks)
+        return Disturbance(scene, see_from_near, offset=offset, drift=drift, landmarks=landmarks)
     if row == "axis":
         return Disturbance(_choose_axis(scene, step, rng), lambda known, *_: known)
     if row == "nothing":

@@ -70,7 +70,7 @@ class Physics:
         grasp_force: Force, averaged over 20 ms, above which a hand loses its hold [N]. A parallel
             gripper that closes with 235 N holds 2 · 0.6 · 235 N by its rubber pads.
         grasp_torque: Torque, averaged over 20 ms, above which a hand loses its hold [N·m].
-        grasp_stiffness: Stiffness of a hand against displacements of what it holds [N/m].
+        grasp_stiffness: Stiffness of a hand against displacements of the object [N/m].
         grasp_turning_stiffness: Stiffness against rotations [N·m/rad]. The default is that of a
             strain wave gear of a wrist; fingers with rubber pads yield more.
         closing_force: Force of each finger in grasps by friction [N]; a lower effort limit in the

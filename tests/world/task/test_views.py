@@ -122,7 +122,7 @@ def test_arm_in_front_of_the_target_is_a_violation() -> None:
 
 
 def is_hidden_by_robot(plan: vkc.Plan, eye: Floats, point: Floats, own: str, time: float) -> bool:
-    """Return whether a small ball on the way from an eye to a point touches another link."""
+    """Return whether a small ball between an eye and a point touches another link."""
     robot = plan.scene.robot
     length = float(np.linalg.norm(point - eye))
     ball = coal.Sphere(1e-4)

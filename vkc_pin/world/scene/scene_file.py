@@ -194,8 +194,8 @@ def allow_pair(fields: Mapping[str, Any], pair: tuple[str, str], margin: float) 
     """
     described = fields["described"]
     labels, _ = _list_labels(described, fields["robot"], fields["objects"])
+    links = [label for label in labels if labels[label] == [label]]
     for name, argument in zip(pair, ("first", "second"), strict=True):
-        links = [label for label in labels if labels[label] == [label]]
         check_choice(name, links, "link", argument)
     key = frozenset(pair)
     least = min(margin, fields["allowed"].get(key, np.inf))

@@ -9,6 +9,7 @@ import numpy as np
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.trajectory.curve import Curve
 from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.wheels import rotate_into_base_frame
 
 
 def place_base(frame: Floats, rows: Floats) -> Floats:
@@ -26,9 +27,8 @@ def place_base(frame: Floats, rows: Floats) -> Floats:
 def turn_base(yaw: float, rows: Floats) -> Floats:
     """Return configurations or velocities whose base's x and y are turned by a yaw [rad]."""
     turned = np.array(rows, float)
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    turned[..., 0] = cos * rows[..., 0] - sin * rows[..., 1]
-    turned[..., 1] = sin * rows[..., 0] + cos * rows[..., 1]
+    # The inverse of a rotation into frames with this yaw
+    turned[..., 0], turned[..., 1] = rotate_into_base_frame(rows[..., 0], rows[..., 1], -yaw)
     return turned
 
 

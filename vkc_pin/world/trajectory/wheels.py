@@ -79,7 +79,7 @@ class RollingLimits:
         return np.asarray(rolled / self.wheel_speed)
 
 
-def rotate_into_base_frame(x: Floats, y: Floats, yaws: Floats) -> tuple[Floats, Floats]:
+def rotate_into_base_frame(x: Floats, y: Floats, yaws: Floats | float) -> tuple[Floats, Floats]:
     """Rotate world vectors (x, y) into base frames with these yaw angles, shape (K,) each."""
     cos = np.cos(yaws)
     sin = np.sin(yaws)

@@ -71,6 +71,11 @@ def _add_scenes(benches: Any) -> None:
     about = "sources of the room (default: all)"
     parser.add_argument("--sources", nargs="+", metavar="SOURCE", help=about)
 
+    about = "plan motions again, towards objects that have been displaced"
+    parser = _add_benchmark(benches, "replans", about, "replans")
+    add_count(parser, "--starts", 15, "random starts and displacements per task")
+    add_choice(parser, "tasks", "door corridor_door drawer household_refrigerator (default: all)")
+
     parser = _add_benchmark(benches, "gap", "reach over a table beyond a gap of 0.85 m", "gap")
     add_count(parser, "--trials", 50, "random starts of base and arm")
 

@@ -103,6 +103,20 @@ def test_small_corrections_are_followed() -> None:
     np.testing.assert_allclose(end, plan_motion().trajectory.positions[-1][:9], atol=1e-9)
 
 
+def test_localised_heading_jumps_by_a_whole_turn() -> None:
+    """It is no correction if the localisation states -π instead of π."""
+    before = np.array([0.0, 0.0, np.pi - 5e-4])
+    after = np.array([0.0, 0.0, -np.pi + 5e-4])
+    robot = make_robot(before)
+    localised = LocalisedRobot(robot, lambda: after if robot.time > 1.0 else before)
+    result = execute(plan_motion(), localised, tracking=0.004)
+    assert result.success, result
+    assert result.count_decisions() == {"go on": len(result.cycles)}
+    turned = after + np.array([0.0, 0.0, 2.0 * np.pi])
+    end = place_base(turned, robot.compute_state(60.0).positions)
+    np.testing.assert_allclose(end, plan_motion().trajectory.positions[-1][:9], atol=1e-9)
+
+
 def test_large_correction_is_planned_again() -> None:
     """The localisation finds out that it was 40 mm off: the robot goes on from where it is."""
     late = np.array([0.04, 0.0, 0.0])

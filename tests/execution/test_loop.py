@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -194,6 +195,27 @@ def test_plan_from_rest_keeps_the_terms_of_the_user() -> None:
     # There is no time to look for another motion first, which would be part of the reason.
     assert (first.decision, first.reason) == ("brake", "base_link – stool")
     assert result.plans[-1][1].terms == plan.terms
+
+
+def test_heading_is_measured_modulo_whole_turns() -> None:
+    """Odometry states headings from -π to π; the motion passes π."""
+
+    class Odometry(IdealRobot):
+        def read(self) -> RobotState:
+            state = super().read()
+            positions = state.positions.copy()
+            positions[2] = (positions[2] + np.pi) % (2.0 * np.pi) - np.pi
+            return dataclasses.replace(state, positions=positions)
+
+    start = vkc.load_scene("door").with_start(base=[0.0, 0.0, 2.9])
+    plan = vkc.plan(start, [vkc.GoTo(-0.3, 0.0, 3.6)])
+    assert plan.success, plan.summary()
+    yaw = plan.trajectory.positions[:, 2]
+    assert yaw.min() < np.pi < yaw.max()
+    robot = Odometry(plan.scene, is_simulated=True)
+    result = execute(plan, robot, **CALM)
+    assert result.success, result
+    assert result.count_decisions() == {"go on": len(result.cycles)}
 
 
 def test_robot_off_its_motion_is_brought_back() -> None:

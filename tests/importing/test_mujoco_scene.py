@@ -324,6 +324,20 @@ def test_motion_ends_at_the_goal_in_the_models_coordinates(model: Any, plan: vkc
         motion.positions(["elbow"])
 
 
+@pytest.mark.parametrize("turns", [-2, 1])
+def test_base_does_not_turn_back_before_it_moves(model: Any, turns: int) -> None:
+    """A hinge that has turned several times goes on from there."""
+    data = make_data(model)
+    data.joint("base_yaw").qpos += 2.0 * np.pi * turns
+    mujoco.mj_forward(model, data)
+    scene = vkc.scene_from_mujoco(model, data, robot=ROBOT)
+    plan = vkc.plan(scene, [vkc.GoTo(-0.6, 0.3, 0.5)])
+    motion = plan.to_mujoco(model, 50.0, data=data)
+    assert motion.qpos[0] == pytest.approx(data.qpos, abs=1e-9)
+    assert np.ptp(motion.positions(["base_yaw"])) < 0.5
+    assert np.abs(np.diff(motion.ctrl, axis=0)).max() < 0.1
+
+
 def test_controls_open_the_drawer(model: Any, plan: vkc.Plan) -> None:
     data = make_data(model)
     motion = plan.to_mujoco(model, 1.0 / model.opt.timestep, data=data)

@@ -219,6 +219,15 @@ def test_measured_state_is_where_the_new_motion_begins() -> None:
     np.testing.assert_array_equal(found.trajectory.velocity(0.0)[:9], velocity)
 
 
+def test_measured_heading_may_count_other_turns() -> None:
+    plan = plan_door()
+    state = plan.trajectory.at(1.0)[:9]
+    turned = state + 2.0 * np.pi * np.eye(9)[2]
+    found = vkc.replan(plan, 1.0, state=turned, time_limit=30.0)
+    assert found.success, found.summary()
+    np.testing.assert_allclose(found.trajectory.positions[0, :9], state, atol=1e-9)
+
+
 def test_steps_that_are_over_are_dropped() -> None:
     plan = plan_through_door()
     assert find_remaining_steps(plan, 0.0) == plan.steps

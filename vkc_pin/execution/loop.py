@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import operator
 import time
 from collections.abc import Callable
@@ -236,7 +237,7 @@ class _Loop:
         self._seen = list[tuple[float, tuple[pin.GeometryObject, ...]]]()
 
     def run(self) -> ExecutionResult:
-        state = self._robot.read()
+        state = self._read()
         monitor = Monitor(self._first, tracking=self._settings.tracking)
         finding = monitor.check_tracking(float(self._first.trajectory.times[0]), state)
         if finding:
@@ -275,7 +276,7 @@ class _Loop:
             now = self._robot.time
             began = time.perf_counter()
             motion_time = self._get_motion_time(now)
-            decision, why = self._decide(now, self._robot.read())
+            decision, why = self._decide(now, self._read())
             latency = time.perf_counter() - began
             self._cycles.append(Cycle(now, motion_time, latency, decision, why))
             # A robot at rest misses nothing while a motion is searched.
@@ -284,8 +285,20 @@ class _Loop:
                 return why
             end = float(self._plan.trajectory.times[-1])
             if self._rest is None and self._get_motion_time(now) >= end:
-                return self._monitor.check_tracking(end, self._robot.read())
+                return self._monitor.check_tracking(end, self._read())
             next_cycle = max(next_cycle + self._settings.period, self._robot.time)
+
+    def _read(self) -> RobotState:
+        """Return the measured state; headings count turns as the present motion does."""
+        state = self._robot.read()
+        motion = self._first.trajectory
+        time = float(motion.times[0])
+        if self._sent:
+            motion = self._plan.trajectory
+            time = self._get_motion_time(state.time)
+        near = motion.at(time)[: motion.robot_size]
+        positions = self._first.scene.robot.unwrap(state.positions, near)
+        return dataclasses.replace(state, positions=positions)
 
     def _rehearse(self) -> None:
         """Plan the rest of the motion before it begins, to load and build what that takes.
@@ -439,7 +452,7 @@ class _Loop:
         error_rate = np.zeros(size)
         measured = 0.0
         if pulls:
-            state = self._robot.read()
+            state = self._read()
             measured = self._get_motion_time(state.time)
             error = state.positions - plan.trajectory.at(measured)[:size]
             error_rate = state.velocities - plan.trajectory.velocity(measured)[:size]
@@ -535,7 +548,7 @@ class _Loop:
         scene = self._look(self._plan.scene_at(end))
         if self._joint is not None:
             scene = self._joint.update(scene)
-        positions = self._robot.read().positions
+        positions = self._read().positions
         distance = float(np.abs(positions - scene.start).max())
         if self._pull or distance > self._settings.tracking:
             scene = scene.with_start(base=positions[:3], arm=positions[3:])
@@ -550,7 +563,7 @@ class _Loop:
         """
         if self._settings.observer is None or self._pulled_to is None:
             return False
-        moved = np.abs(self._robot.read().positions - self._pulled_to)
+        moved = np.abs(self._read().positions - self._pulled_to)
         return bool(moved.max() > self._settings.tracking)
 
 

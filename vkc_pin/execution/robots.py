@@ -150,6 +150,7 @@ class LocalisedRobot:
         self._locate = locate
         self._step = check_number(step, "step", "a distance [m], [rad]", low=0.0)
         self._sent: tuple[float, Trajectory, Floats] | None = None  # begin, motion, frame
+        self._yaw = 0.0  # of the frame, as read last [rad]
 
     @property
     def time(self) -> float:
@@ -209,7 +210,10 @@ class LocalisedRobot:
         if frame.shape != (3,):
             expected, got = "x, y [m], yaw [rad]", format_value(frame.tolist())
             raise InputError("wrong shape", field="locate()", expected=expected, got=got)
-        return frame
+        # A yaw that jumps by whole turns has not changed.
+        turns = np.round((self._yaw - frame[2]) / (2.0 * np.pi))
+        self._yaw = float(frame[2] + 2.0 * np.pi * turns)
+        return np.array([*frame[:2], self._yaw])
 
 
 def send_soon(

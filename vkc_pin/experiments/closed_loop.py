@@ -307,9 +307,11 @@ def _disturb(row: str, found: Plan, rng: np.random.Generator) -> Disturbance:
 
     if row == "displaced":
         at = scene.objects[name].placement.translation
-        return Disturbance(_displace(scene, name, 0.05, np.radians(5.0), at, rng), see_from_near)
+        return Disturbance(
+            displace_object(scene, name, 0.05, np.radians(5.0), at, rng), see_from_near
+        )
     if row == "grasp":
-        actual = _displace(scene, name, 0.008, np.radians(3.0), at_grasp, rng)
+        actual = displace_object(scene, name, 0.008, np.radians(3.0), at_grasp, rng)
         return Disturbance(actual, see_in_hand)
     if row == "localisation":
         angle = rng.uniform(0.0, 2.0 * np.pi)
@@ -350,7 +352,7 @@ def _is_near(scene: Scene, measured: Floats, place: Floats) -> bool:
     return float(np.linalg.norm(there.tool_placement().translation - place)) < _NOTICE
 
 
-def _displace(
+def displace_object(
     scene: Scene, name: str, largest: float, turn: float, about: Floats, rng: np.random.Generator
 ) -> Scene:
     """Return a scene with an object elsewhere, by up to a distance [m] and an angle [rad].

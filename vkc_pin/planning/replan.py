@@ -45,7 +45,8 @@ def replan(
     Args:
         plan: A successful plan.
         time: Time of its motion at which the new one takes over [s].
-        state: Measured configuration of the robot at that time, shape (n,). Default: the scene's.
+        state: Measured configuration of the robot at that time, shape (n,), with headings and
+            continuous joints of any turn. Default: the scene's.
         velocity: Measured velocity of the robot, shape (n,), [m/s] and [rad/s], or coordinate →
             velocity. Default: the scene's.
         scene: The world at that time: `plan.scene_at(time)`, with measured placements.
@@ -73,6 +74,7 @@ def replan(
             raise InputError(
                 "wrong shape", field="state", expected=now.start.shape, got=values.shape
             )
+        values = now.robot.unwrap(values, now.start)
         now = now.with_start(base=values[:3], arm=values[3:])
     if velocity is not None:
         now = now.with_start(velocity=velocity)

@@ -171,7 +171,11 @@ class _Writer:
         if self._robot.base_joints:
             motion = self._robot.find_base_motion(self._data)
             base = [self._joints.get_address(name) for name in self._robot.base_joints]
-            qpos[:, base] = motion.invert(rows[:, :3])
+            positions = motion.invert(rows[:, :3])
+            # The scene's heading may count other turns than the hinge, whose servo would turn back.
+            turns = np.round((self._data.qpos[base[2]] - positions[0, 2]) / (2.0 * np.pi))
+            positions[:, 2] += 2.0 * np.pi * turns
+            qpos[:, base] = positions
             return elevation
         gap = rows[0, :3] - pose
         gap[2] = np.arctan2(np.sin(gap[2]), np.cos(gap[2]))

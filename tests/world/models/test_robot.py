@@ -83,3 +83,17 @@ def test_visual_geometry_is_simplified(husky: Robot) -> None:
         shape.geometry.num_tris for shape in shapes if isinstance(shape.geometry, coal.BVHModelBase)
     )
     assert 10_000 < triangles < 100_000
+
+
+def test_unwrapped_headings_count_turns_as_others_do(husky: Robot) -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        near = rng.uniform(-9.0, 9.0, 9)
+        measured = near + rng.uniform(-0.1, 0.1, 9)
+        wrapped = measured.copy()
+        wrapped[2] -= 2.0 * np.pi * rng.integers(-3, 4)
+        np.testing.assert_allclose(husky.unwrap(wrapped, near), measured, atol=1e-12)
+    # The arm's joints have limits: a whole turn more is another configuration.
+    turned = husky.home + 2.0 * np.pi
+    z = np.concatenate([np.zeros(3), turned])
+    np.testing.assert_array_equal(husky.unwrap(z, np.zeros(9))[3:], turned)

@@ -13,6 +13,7 @@ from typing import Literal
 import coal
 import numpy as np
 import pinocchio as pin
+from numpy.typing import ArrayLike
 
 from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import check_integer
@@ -149,6 +150,19 @@ class Robot:
         """Return whether full turns of a coordinate make no difference."""
         is_angle = self.coordinates.units[coordinate] == "rad"
         return is_angle and bool(np.isinf(self.upper[coordinate]))
+
+    def unwrap(self, positions: ArrayLike, near: ArrayLike) -> Floats:
+        """Return coordinates, shape (n,), whose periodic ones count turns as others do.
+
+        Who measures an angle may not count turns: odometry states headings from -π to π [rad].
+        """
+        unwrapped = np.array(positions, float)
+        near = np.asarray(near, float)
+        for column in range(len(unwrapped)):
+            if self.is_periodic(column):
+                turns = np.round((near[column] - unwrapped[column]) / (2.0 * np.pi))
+                unwrapped[column] += 2.0 * np.pi * turns
+        return unwrapped
 
     @cached_property
     def efforts(self) -> TorqueLimits:

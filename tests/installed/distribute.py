@@ -23,7 +23,8 @@ def main() -> None:
         options += ["--scheduler", cluster.scheduler_address, "--quiet"]
         out = Path("initialization").resolve()
         subprocess.run([COMMAND, "bench", "initialization", *options, "--out", out], check=True)
-    assert len(json.loads((out / "results.json").read_text(encoding="utf-8"))["trials"]) == 1
+    # "auto", and step after step
+    assert len(json.loads((out / "results.json").read_text(encoding="utf-8"))["trials"]) == 2
 
 
 if __name__ == "__main__":

@@ -86,8 +86,8 @@ def scene_from_mujoco(  # noqa: PLR0913 - keyword options of a public call
     `model` and `data`.
 
     The robot's base is found by the axes of its joints, which have to be the model's: names of
-    bodies and placements of links do not matter. Changes and omissions are warnings, and the file
-    of each object states why a joint has no attachment.
+    bodies and placements of links do not matter. Changes and omissions are warnings, and so are
+    the reasons why a joint has no attachment.
 
     Args:
         model: The `mujoco.MjModel`.
@@ -157,6 +157,8 @@ def scene_from_mujoco(  # noqa: PLR0913 - keyword options of a public call
         notes += [*home.notes, *parts.notes]
         for item in parts.objects:
             notes += [f"{item.name}: {note}" for note in item.notes]
+            for joint, reason in item.proposals.because.items():
+                notes.append(f"{item.name}: no hand can move {joint}: {reason}")
         arena = _find_arena(home, description, pose)
         document: dict[str, Any] = {
             "name": clean_name(description.file.name),

@@ -174,6 +174,15 @@ def test_only_chosen_objects_move(model: Any) -> None:
     assert lowest < 1e-6
 
 
+def test_reason_why_nothing_can_be_grasped_is_a_warning(model: Any) -> None:
+    data = make_data(model)
+    too_far = vkc.Options(dist_safe=0.5)
+    with pytest.warns(
+        UserWarning, match="home_oven: no hand can move home_oven_hinge: of .* places"
+    ):
+        vkc.scene_from_mujoco(model, data, robot=ROBOT, objects=["home/oven"], options=too_far)
+
+
 def test_floor_and_raised_robot(model: Any) -> None:
     data = make_data(model)
     raised = vkc.scene_from_mujoco(model, data, robot=ROBOT, floor=-0.2, objects=["home/drawer"])

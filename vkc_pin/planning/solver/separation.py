@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vkc_pin.planning.chain.contacts import Contacts, make_empty_contacts
+from vkc_pin.planning.chain.contacts import Contacts
 from vkc_pin.planning.nlp.problem import TrajectoryProblem
 from vkc_pin.planning.solver.segment_planes import Crossing, merge_contacts
 from vkc_pin.utils.arrays import Bools, Floats, Ints
@@ -44,6 +44,43 @@ class _Stretch(NamedTuple):
         is_near = (row >= self.first - margin) & (row <= self.last + margin)
         is_between_bodies = (bodies == self.bodies).all(axis=1)
         return is_near & (phases == self.phase) & is_between_bodies
+
+
+class _Gaps(NamedTuple):
+    """Distances of P pairs of shapes in one direction at each of B configurations.
+
+    Attributes:
+        pairs: Geometries, shape (P, 2).
+        margin: Required clearance, shape (P,) [m].
+        normal: Direction from the first to the second shapes, in the world, shape (B, 3).
+        first, second: Witness points in the world, shape (P, B, 3) [m].
+        distance: Shape (P, B) [m].
+    """
+
+    pairs: Ints
+    margin: Floats
+    normal: Floats
+    first: Floats
+    second: Floats
+    distance: Floats
+
+    def to_contacts(self, pairs: Ints, configurations: Ints, rows: Ints) -> Contacts:
+        """Return contacts of C chosen pairs at chosen configurations.
+
+        Args:
+            pairs: Number of each contact's pair, shape (C,).
+            configurations: Number of its configuration, shape (C,).
+            rows: Waypoint of each configuration, shape (B,).
+        """
+        return Contacts(
+            waypoint=rows[configurations],
+            pair=self.pairs[pairs],
+            distance=self.distance[pairs, configurations],
+            margin=self.margin[pairs],
+            normal=self.normal[configurations],
+            first=self.first[pairs, configurations],
+            second=self.second[pairs, configurations],
+        )
 
 
 class Separation:
@@ -183,10 +220,13 @@ class Separation:
         rows = np.arange(stretch.first, stretch.last + 1)
         assert stretch.direction is not None
         directions = np.tile(stretch.direction, (len(rows), 1))
-        return self._measure(z[rows], stretch, directions, rows)
+        gaps = self._measure(z[rows], stretch, directions)
+        count = len(gaps.margin)
+        pairs = np.repeat(np.arange(count), len(rows))
+        return merge_contacts(gaps.to_contacts(pairs, np.tile(np.arange(len(rows)), count), rows))
 
-    def _measure(self, z: Floats, stretch: _Stretch, directions: Floats, rows: Ints) -> Contacts:
-        """Return contacts of all pairs of a stretch's bodies in one direction per configuration.
+    def _measure(self, z: Floats, stretch: _Stretch, directions: Floats) -> _Gaps:
+        """Measure all pairs of a stretch's bodies in one direction per configuration.
 
         The witness points are the points of the first shape furthest along n and of the second
         furthest along −n.
@@ -195,31 +235,30 @@ class Separation:
             z: Configurations, shape (B, n).
             stretch: The stretch.
             directions: Directions in the frame of the second body, shape (B, 3).
-            rows: Waypoints of the contacts, shape (B,).
         """
         rotations, translations = self.contacts.compute_placements(z)
         second_joint = max(stretch.bodies[1], 0)
         normal = np.einsum("bij,bj->bi", rotations[:, second_joint], directions)
         part = self.contacts.phases[stretch.phase]
 
-        def find_support(geometry: int, sign: float) -> Floats:
-            """Return the point of a geometry furthest along ±n, in the world, shape (B, 3)."""
-            points = self._get_vertices(stretch.phase, geometry)
-            joint = part.joint[geometry]
-            local = sign * np.einsum("bij,bi->bj", rotations[:, joint], normal)
-            support = points[(local @ points.T).argmax(axis=1)]
-            turned = np.einsum("bij,bj->bi", rotations[:, joint], support)
-            return np.asarray(turned + translations[:, joint])
+        def find_supports(geometries: Ints, sign: float) -> Floats:
+            """Return the points of geometries furthest along ±n, in the world, shape (P, B, 3)."""
+            different, numbers = np.unique(geometries, return_inverse=True)
+            supports = []
+            for geometry in different.tolist():
+                points = self._get_vertices(stretch.phase, geometry)
+                joint = part.joint[geometry]
+                local = sign * np.einsum("bij,bi->bj", rotations[:, joint], normal)
+                support = points[(local @ points.T).argmax(axis=1)]
+                turned = np.einsum("bij,bj->bi", rotations[:, joint], support)
+                supports.append(turned + translations[:, joint])
+            return np.stack(supports)[numbers]
 
-        parts = [make_empty_contacts()]
-        for first, second, number in self._get_pairs(stretch).tolist():
-            a = find_support(first, 1.0)
-            b = find_support(second, -1.0)
-            distance = np.einsum("bi,bi->b", normal, b - a)
-            pair = np.tile([first, second], (len(z), 1))
-            margin = np.full(len(z), part.margins[number])
-            parts.append(Contacts(rows, pair, distance, margin, normal, a, b))
-        return merge_contacts(*parts)
+        pairs = self._get_pairs(stretch)
+        first = find_supports(pairs[:, 0], 1.0)
+        second = find_supports(pairs[:, 1], -1.0)
+        distance = np.einsum("bi,pbi->pb", normal, second - first)
+        return _Gaps(pairs[:, :2], part.margins[pairs[:, 2]], normal, first, second, distance)
 
     def _get_vertices(self, phase: int, geometry: int) -> Floats:
         """Return the vertices of a geometry in the frame of its joint, shape (n, 3) [m]."""
@@ -260,10 +299,10 @@ class Separation:
             reach=problem.options.largest_margin,
             nearest=problem.options.contact_slots,
         )
-        own = self._measure(moved, stretch, directions, np.arange(len(moved)))
-        violation = np.zeros(len(moved))
-        for found in (remaining, own):
-            np.add.at(violation, found.waypoint, np.maximum(found.margin - found.distance, 0.0))
+        own = self._measure(moved, stretch, directions)
+        violation = np.maximum(own.margin[:, None] - own.distance, 0.0).sum(axis=0)
+        shortfall = np.maximum(remaining.margin - remaining.distance, 0.0)
+        np.add.at(violation, remaining.waypoint, shortfall)
         change = moved - np.tile(z[rows], (count, 1))
         detour = np.sqrt((problem.motion_cost.metric * change**2).sum(axis=1))
         moved = moved.reshape(count, len(rows), -1)
@@ -324,8 +363,10 @@ class Separation:
         upper = problem.upper[rows]
         free = upper - lower > 1e-9
         for _ in range(PUSHES):
-            found = self._measure(z, stretch, directions, np.arange(len(z)))
-            found = found.select(np.flatnonzero(found.slot == 0))  # the largest violation
+            gaps = self._measure(z, stretch, directions)
+            deepest = np.argmin(gaps.distance - gaps.margin[:, None], axis=0)
+            every = np.arange(len(z))
+            found = gaps.to_contacts(deepest, every, every)
             gradient = self.contacts.compute_gradients(z, found)
             shortfall = np.maximum(found.margin - found.distance, 0.0)
             step = free * gradient

@@ -236,6 +236,53 @@ def test_robot_off_its_motion_is_brought_back() -> None:
     assert any("base_x is 0.05 m off" in reason for reason in reasons)
 
 
+def test_robot_off_its_motion_brakes_where_it_is() -> None:
+    """A motion that began on the path would move it by what it is off, at once."""
+
+    class Displaced(IdealRobot):
+        def read(self) -> RobotState:
+            state = super().read()
+            if state.time > 1.0 and len(self.motions) == 1:
+                state.positions[0] += 0.05
+            return state
+
+    plan = plan_door()
+    robot = Displaced(plan.scene, is_simulated=True)
+    result = execute(plan, robot, lead=0.5, time_limit=1e-6)
+    assert result.success, result
+    assert result.count_decisions()["brake"] == 1
+    (first, planned), (begin, stop) = robot.motions[:2]
+    there = planned.at(begin - first)[:SIZE]
+    there[0] += 0.05
+    np.testing.assert_allclose(stop.positions[0, :SIZE], there, atol=1e-9)
+
+
+def test_robot_that_has_slipped_at_rest_goes_on_from_there() -> None:
+    class Slipping(IdealRobot):
+        """A robot that is pushed aside by 50 mm while it waits."""
+
+        def read(self) -> RobotState:
+            state = super().read()
+            if len(self.motions) == 1 and state.time > 0.5:
+                state.positions[1] -= 0.05
+            return state
+
+    plan = plan_door()
+    x, y = plan.scene.start[:2]
+    robot = Slipping(plan.scene, is_simulated=True)
+
+    def observe(scene: vkc.Scene) -> vkc.Scene:
+        place = [x, y] if robot.time < 1.0 else [0.95, 0.85]
+        return scene.with_obstacle("stool", [*place, 0.225, 0.0, 0.0, 0.0])
+
+    result = execute(plan, robot, observe=observe, **CALM)
+    assert result.success, result
+    _, motion = robot.motions[-1]
+    there = plan.scene.start.copy()
+    there[1] -= 0.05
+    np.testing.assert_allclose(motion.positions[0, :SIZE], there, atol=1e-9)
+
+
 def test_robot_that_stops_answering_is_stopped() -> None:
     class Silent(IdealRobot):
         """A robot whose measurements end at 1 s, and that notes when it is stopped."""

@@ -13,4 +13,5 @@ def test_drawer_is_replanned_beside_plans_of_the_same_case(tmp_path: Path) -> No
     assert min(record["whole"], record["moving"], record["replan"]) > 0.0
     assert record["moment"] > 0.0
     assert record["longer"] > 0.5
-    assert "| drawer | 1 of 1 |" in table
+    assert record["possible"] is True
+    assert "| drawer | 1 of 1 | 1 of 1 |" in table

@@ -98,7 +98,7 @@ def format_results(result: Mapping[str, Any]) -> str:
         "# Motions that are planned again",
         f"{about['starts']} random starts per task, seed {about['seed']}. Objects are displaced by "
         f"up to {1e3 * _SHIFT:.0f} mm and {np.degrees(_TURN):.0f}° while the robot moves. {JUDGED} "
-        "It counts where a whole plan to the displaced object exists: a door may stand in its wall. "
+        "It counts where a whole plan to the displaced object exists: a door may be in its wall. "
         "Medians of CPU times: of a plan from the start, to the displaced object; of a plan from "
         "the moving state; and of `replan` there. Then medians and 95th percentiles of ratios: of "
         "the times, and of the duration to what is left of the plan before.",

@@ -4,8 +4,9 @@ This script runs where KinDER is installed (kindergarden==0.2.5), without vkc_pi
 
     python kinder_drawer.py export FOLDER 0 20
     python kinder_drawer.py execute FOLDER 0 20
+    python kinder_drawer.py film FOLDER 0 FILE.webp
 
-Between both, `plan_task.py` runs where vkc_pin is installed. The robot is `tidybot.xml` of KinDER.
+After `export`, `plan_task.py` runs where vkc_pin is installed, for the robot `tidybot.xml` of KinDER.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,8 @@ os.environ["MUJOCO_GL"] = os.environ["PYOPENGL_PLATFORM"] = "egl"
 RATE = 10  # [Hz] of actions
 CLOSE = 10  # actions for which the hand waits while the gripper closes
 SETTLE = 20  # actions for which it waits before, and at the end
+FILMED = 3  # actions for each picture of a film
+FASTER = 4.0  # speed of a film
 DRAWER = "kitchen_island_drawer_s0c0_joint"
 OPENED = 0.25  # [m] of 0.6
 ROBOT_JOINTS = [
@@ -55,8 +59,10 @@ def export(folder: Path, seed: int) -> None:
     np.savez(folder / "state.npz", qpos=data.qpos)
 
 
-def execute(folder: Path, seed: int) -> dict[str, object]:
-    """Execute the motion of a reset, and return how it went."""
+def execute(
+    folder: Path, seed: int, watch: Callable[[Any, Any], None] | None = None
+) -> dict[str, object]:
+    """Execute the motion of a reset, and return how it went; `watch` sees the simulation."""
     if not (folder / "motion.npz").is_file():
         return {"seed": seed, "success": False, "reason": "no plan"}
     environment, model, data = make_environment(seed)
@@ -73,6 +79,8 @@ def execute(folder: Path, seed: int) -> dict[str, object]:
         action = np.concatenate([target, [float(closed)], velocity])
         environment.unwrapped.step(action)
         errors.append(np.abs(data.qpos[rows] - target))
+        if watch is not None:
+            watch(model, data)
 
     still = np.zeros(7)
     was_holding = False
@@ -97,8 +105,39 @@ def execute(folder: Path, seed: int) -> dict[str, object]:
     }
 
 
+def film(folder: Path, seed: int, file: str) -> None:
+    """Write a film of the motion of a reset, four times as fast as it is executed."""
+    from PIL import Image
+
+    camera = mujoco.MjvCamera()
+    camera.lookat[:] = [0.9, 0.1, 0.5]
+    camera.distance, camera.azimuth, camera.elevation = 2.3, 215.0, -20.0
+    pictures = []
+    renderers = []
+    count = 0
+
+    def watch(model: Any, data: Any) -> None:
+        nonlocal count
+        count += 1
+        if count % FILMED:
+            return
+        if not renderers:
+            renderers.append(mujoco.Renderer(model, 320, 480))
+        renderers[0].update_scene(data, camera)
+        pictures.append(Image.fromarray(renderers[0].render()))
+
+    print(execute(folder, seed, watch))
+    duration = 1000.0 * FILMED / RATE / FASTER
+    options = {"duration": duration, "loop": 0, "quality": 60}
+    pictures[0].save(file, save_all=True, append_images=pictures[1:], **options)
+
+
 def main() -> None:
     """Run the command line."""
+    if sys.argv[1] == "film":
+        folder, seed, file = sys.argv[2:]
+        film(Path(folder) / f"{int(seed):03d}", int(seed), file)
+        return
     command, folder, first, last = sys.argv[1:]
     results = []
     for seed in range(int(first), int(last)):

@@ -6,7 +6,7 @@ This script runs where KinDER is installed (kindergarden==0.2.5), without vkc_pi
     python kinder_drawer.py execute FOLDER 0 20
     python kinder_drawer.py film FOLDER 0 FILE.webp
 
-After `export`, `plan_task.py` runs where vkc_pin is installed, for the robot `tidybot.xml` of KinDER.
+After `export`, `plan_task.py` runs where vkc_pin is, for the robot `tidybot.xml` of KinDER.
 """
 
 from __future__ import annotations

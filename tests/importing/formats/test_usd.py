@@ -1229,3 +1229,35 @@ def test_robots_are_read(tmp_path: Path) -> None:
                 limits[f"{name}_{source.suffix}"] = ends
     assert len(limits) % 3 == 0  # in both
     assert len(limits) > 12
+
+
+def test_robots_are_imported(tmp_path: Path) -> None:
+    """A robot of a stage is the one of the URDF: joints, limits, hand; and it moves."""
+    urdf = write_arms(tmp_path)
+    file = tmp_path / "arm.usdc"
+    write_description(read_description(urdf), file, metres=0.01, up="Y", kilograms=1.0)
+    robots = []
+    for source in (urdf, file):
+        target = tmp_path / source.suffix[1:]
+        robots.append(vkc.importing.import_robot(source, target, samples=500).robot)
+    same, robot = robots
+    assert robot.coordinates.names == tuple(
+        name if name.startswith("base_") else f"joint_{name}" for name in same.coordinates.names
+    )
+    np.testing.assert_allclose(robot.lower[3:], same.lower[3:], atol=1e-5)
+    np.testing.assert_allclose(robot.upper[3:], same.upper[3:], atol=1e-5)
+    assert robot.touch_links == same.touch_links
+    assert robot.gripper is not None
+    rng = np.random.default_rng(2)
+    for _ in range(5):
+        z = np.concatenate([rng.uniform(-1.0, 1.0, 3), rng.uniform(same.lower[3:], same.upper[3:])])
+        tools = []
+        for one in robots:
+            data = one.model.createData()
+            pin.framesForwardKinematics(one.model, data, one.coordinates.q(z))
+            tools.append(data.oMf[one.model.getFrameId(one.tool_frame)])
+        apart = tools[0].actInv(tools[1])
+        assert np.linalg.norm(apart.translation) < 1e-4
+    scene = vkc.load_scene(tmp_path / "usdc" / "scene.yaml")
+    plan = vkc.plan(scene, [vkc.GoTo(1.0, 0.5, 0.7)])
+    assert plan.success, plan.summary()

@@ -112,8 +112,8 @@ def film(folder: Path, seed: int, file: str) -> None:
     camera = mujoco.MjvCamera()
     camera.lookat[:] = [0.9, 0.1, 0.5]
     camera.distance, camera.azimuth, camera.elevation = 2.3, 215.0, -20.0
-    pictures = []
-    renderers = []
+    pictures = list[Image.Image]()
+    renderers = list[Any]()
     count = 0
 
     def watch(model: Any, data: Any) -> None:
@@ -127,16 +127,18 @@ def film(folder: Path, seed: int, file: str) -> None:
         pictures.append(Image.fromarray(renderers[0].render()))
 
     print(execute(folder, seed, watch))
-    duration = 1000.0 * FILMED / RATE / FASTER
-    options = {"duration": duration, "loop": 0, "quality": 60}
-    pictures[0].save(file, save_all=True, append_images=pictures[1:], **options)
+    duration = 1000.0 * FILMED / RATE / FASTER  # [ms]
+    others = pictures[1:]
+    pictures[0].save(
+        file, save_all=True, append_images=others, duration=duration, loop=0, quality=60
+    )
 
 
 def main() -> None:
     """Run the command line."""
     if sys.argv[1] == "film":
-        folder, seed, file = sys.argv[2:]
-        film(Path(folder) / f"{int(seed):03d}", int(seed), file)
+        parent, number, file = sys.argv[2:]
+        film(Path(parent) / f"{int(number):03d}", int(number), file)
         return
     command, folder, first, last = sys.argv[1:]
     results = []

@@ -69,7 +69,8 @@ class MapObstacle:
                 "the map has too many separate cells",
                 file=self._file,
                 field="image",
-                expected=f"cells that {_MAX_BOXES} boxes cover",
+                expected=f"cells that {_MAX_BOXES} boxes cover: a part of the map, or larger cells",
+                got=" × ".join(map(str, blocked.shape)) + f" cells of {self._map.resolution:g} m",
             )
         boxes = self._map.resolution * cells.astype(float)
         if is_blocking:

@@ -222,7 +222,7 @@ def test_wrong_arguments_are_named(tmp_path: Path) -> None:
 
 
 def test_too_many_boxes_are_refused(tmp_path: Path) -> None:
-    board = np.indices((143, 143)).sum(axis=0) % 2 * 254
+    board = np.indices((201, 201)).sum(axis=0) % 2 * 254
     write_map(tmp_path, board)
-    with expect_error(r"map\.yaml: image: the map has too many separate cells .*10000 boxes"):
+    with expect_error(r"map\.yaml: image: the map has too many separate cells .*20000 boxes"):
         vkc.Scene.from_document(make_document(map="map.yaml"), tmp_path)

@@ -69,6 +69,14 @@ TASKS = {
         slower=4.0,
         objects=("kitchen_island_drawer_s0c0",),
     ),
+    # The environment asks for less than 0.3 m from 0.37 m.
+    "franka_kitchen": Task(
+        steps=(vkc.Actuate("slide", {"slide_cabinet": 0.37}),),
+        joints={f"robot_panda0_joint{k}": f"robot:panda0_joint{k}" for k in range(1, 8)},
+        rate=12.5,
+        slower=4.0,
+        objects=("slidelink",),
+    ),
     # Handle and front are 16 mm apart. The environment asks for 0.14 m.
     "libero_drawer": Task(
         steps=(vkc.Actuate("wooden_cabinet_1_base", {"wooden_cabinet_1_top_level": -0.155}),),

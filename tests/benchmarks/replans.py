@@ -26,14 +26,13 @@ from vkc_pin.experiments.harness.tables import (
 from vkc_pin.experiments.tasks import TASKS as ALL
 from vkc_pin.experiments.tasks import make_start
 from vkc_pin.planning.plan import Plan
-from vkc_pin.world.scene.scene import Scene
 
 TASKS = ("door", "corridor_door", "drawer", "household_refrigerator")
 """Tasks whose motions are planned again."""
 
 _SHIFT = 0.05  # [m], largest
 _TURN = float(np.radians(5.0))  # largest
-_MOMENTS = (0.1, 0.6)  # shares of the way to the grasp at which the new motion begins
+_MOMENTS = (0.1, 0.6)  # shares of the time until the grasp at which the new motion begins
 _REPEATS = 2  # of which the faster one counts
 
 
@@ -101,7 +100,7 @@ def format_results(result: Mapping[str, Any]) -> str:
         "It counts where a whole plan to the displaced object exists: a door may be in its wall. "
         "Medians of CPU times: of a plan from the start, to the displaced object; of a plan from "
         "the moving state; and of `replan` there. Then medians and 95th percentiles of ratios: of "
-        "the times, and of the duration to what is left of the plan before.",
+        "the times, and of the duration to the rest of the plan before.",
         format_table(head, rows),
     )
 
@@ -127,7 +126,8 @@ def _record(spec: dict[str, Any]) -> Record:
     motion = before.trajectory
     (step,) = steps
     assert isinstance(step, vkc.Actuate)
-    displaced = _displace(start, step.object, rng)
+    at = start.objects[step.object].placement.translation
+    displaced = displace_object(start, step.object, _SHIFT, _TURN, at, rng)
     closing = float(motion.times[motion.phases[0].last])
     moment = closing * rng.uniform(*_MOMENTS)
     placement = displaced.objects[step.object].placement
@@ -143,11 +143,6 @@ def _record(spec: dict[str, Any]) -> Record:
     fields |= {"moment": moment, "longer": longer, "possible": from_start.success}
     fields |= {"whole": whole, "moving": moving, "replan": replan}
     return trial(found, **fields)
-
-
-def _displace(start: Scene, name: str, rng: np.random.Generator) -> Scene:
-    place = start.objects[name].placement.translation
-    return displace_object(start, name, _SHIFT, _TURN, place, rng)
 
 
 def _measure(make: Callable[[], Plan]) -> tuple[Plan, float]:

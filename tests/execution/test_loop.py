@@ -237,7 +237,7 @@ def test_robot_off_its_motion_is_brought_back() -> None:
 
 
 def test_robot_off_its_motion_brakes_where_it_is() -> None:
-    """A motion that began on the path would move it by what it is off, at once."""
+    """A motion that began on the path would jump by the tracking error."""
 
     class Displaced(IdealRobot):
         def read(self) -> RobotState:

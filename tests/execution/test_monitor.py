@@ -1,4 +1,4 @@
-"""Tests what the closed loop notices."""
+"""Tests the monitor of the closed loop."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vkc_pin.execution.monitor import Monitor
         ("door", 0.0005, 0.0, False),
         ("door", 0.002, 0.0, True),
         ("door", 0.0, 0.005, True),
-        # What stands freely is touched, and a little is no reason to plan again.
+        # Free objects are touched, and move a little: no reason to plan again.
         ("cup", 0.002, 0.0, False),
         ("cup", 0.0, 0.02, False),
         ("cup", 0.005, 0.0, True),

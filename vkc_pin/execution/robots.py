@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from vkc_pin.errors import InputError, format_value
 from vkc_pin.utils.arguments import check_finite_array, check_instance, check_number
 from vkc_pin.utils.arrays import Floats
+from vkc_pin.world.models.coordinates import wrap_angle
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.frames import invert_frame, place_base, place_motion, turn_base
 from vkc_pin.world.trajectory.robot_state import RobotState as RobotState
@@ -211,8 +212,7 @@ class LocalisedRobot:
             expected, got = "x, y [m], yaw [rad]", format_value(frame.tolist())
             raise InputError("wrong shape", field="locate()", expected=expected, got=got)
         # A yaw that jumps by whole turns has not changed.
-        turns = np.round((self._yaw - frame[2]) / (2.0 * np.pi))
-        self._yaw = float(frame[2] + 2.0 * np.pi * turns)
+        self._yaw += float(wrap_angle(frame[2] - self._yaw))
         return np.array([*frame[:2], self._yaw])
 
 

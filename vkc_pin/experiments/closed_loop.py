@@ -307,9 +307,8 @@ def _disturb(row: str, found: Plan, rng: np.random.Generator) -> Disturbance:
 
     if row == "displaced":
         at = scene.objects[name].placement.translation
-        return Disturbance(
-            displace_object(scene, name, 0.05, np.radians(5.0), at, rng), see_from_near
-        )
+        actual = displace_object(scene, name, 0.05, np.radians(5.0), at, rng)
+        return Disturbance(actual, see_from_near)
     if row == "grasp":
         actual = displace_object(scene, name, 0.008, np.radians(3.0), at_grasp, rng)
         return Disturbance(actual, see_in_hand)

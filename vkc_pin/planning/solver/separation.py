@@ -221,9 +221,8 @@ class Separation:
         assert stretch.direction is not None
         directions = np.tile(stretch.direction, (len(rows), 1))
         gaps = self._measure(z[rows], stretch, directions)
-        count = len(gaps.margin)
-        pairs = np.repeat(np.arange(count), len(rows))
-        return merge_contacts(gaps.to_contacts(pairs, np.tile(np.arange(len(rows)), count), rows))
+        pairs, configurations = np.indices(gaps.distance.shape).reshape(2, -1)
+        return merge_contacts(gaps.to_contacts(pairs, configurations, rows))
 
     def _measure(self, z: Floats, stretch: _Stretch, directions: Floats) -> _Gaps:
         """Measure all pairs of a stretch's bodies in one direction per configuration.

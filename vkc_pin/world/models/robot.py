@@ -19,7 +19,7 @@ from vkc_pin.errors import InputError
 from vkc_pin.utils.arguments import check_integer
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.files.urdf import UrdfFile
-from vkc_pin.world.models.coordinates import Coordinates, MovedJoint
+from vkc_pin.world.models.coordinates import Coordinates, MovedJoint, wrap_angle
 from vkc_pin.world.models.dynamics import TorqueLimits, compute_torque_limits
 from vkc_pin.world.models.grafting import round_placement
 from vkc_pin.world.models.gripper import Gripper
@@ -160,8 +160,8 @@ class Robot:
         near = np.asarray(near, float)
         for column in range(len(unwrapped)):
             if self.is_periodic(column):
-                turns = np.round((near[column] - unwrapped[column]) / (2.0 * np.pi))
-                unwrapped[column] += 2.0 * np.pi * turns
+                turned = wrap_angle(unwrapped[column] - near[column])
+                unwrapped[column] = near[column] + turned
         return unwrapped
 
     @cached_property

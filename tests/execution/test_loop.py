@@ -86,6 +86,23 @@ def test_door_that_turns_out_to_be_elsewhere_is_opened() -> None:
     check_smooth(robot, result)
 
 
+def test_robot_brakes_at_once_before_an_object_that_is_seen_late() -> None:
+    """The hand is already near: there is no time to look for another motion first."""
+    plan = plan_door()
+    motion = plan.trajectory
+    closing = float(motion.times[next(phase.first for phase in motion.phases if phase.holds)])
+    at = plan.scene.objects["door"].placement
+    moved = pin.SE3(at.rotation, at.translation + np.array([-0.03, 0.0, 0.0]))
+
+    def observe(scene: vkc.Scene, time: float) -> vkc.Scene:
+        return scene.with_placement("door", moved) if time > closing - 0.4 else scene
+
+    result, _ = run(observe)
+    assert result.success, result
+    reacted = [cycle for cycle in result.cycles if cycle.reason]
+    assert (reacted[0].decision, reacted[0].reason) == ("brake", "door is elsewhere")
+
+
 def test_robot_goes_round_what_appears_on_its_path() -> None:
     x, y = plan_door().trajectory.at(2.0)[:2]
     pose = [x, y + 0.55, 0.3, 0.0, 0.0, 0.0]

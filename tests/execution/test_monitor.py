@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pinocchio as pin
 import pytest
 
@@ -32,3 +33,23 @@ def test_displaced_objects_are_noticed(
     placement.rotation = pin.utils.rotate("z", angle) @ placement.rotation
     finding, _ = Monitor(plan).check_world(0.0, plan.scene.with_placement(name, placement))
     assert bool(finding) is notices, finding
+
+
+def test_object_that_is_elsewhere_is_touched_before_its_grasp(door_plan: vkc.Plan) -> None:
+    monitor = Monitor(door_plan)
+    scene = door_plan.scene
+    motion = door_plan.trajectory
+    closing = float(motion.times[next(p.first for p in motion.phases if p.holds)])
+    there = scene.objects["door"].placement
+
+    def displace(x: float) -> vkc.Scene:
+        shift = pin.SE3(np.eye(3), np.array([x, 0.0, 0.0]))
+        return scene.with_placement("door", shift * there)
+
+    finding, touched = monitor.check_world(0.0, displace(-0.03))
+    assert finding == "door is elsewhere"
+    assert 0.0 < touched < closing
+    assert monitor.check_world(0.0, displace(8.0)) == ("door is elsewhere", np.inf)
+    # What is in the hand is always near.
+    end = float(motion.times[-1])
+    assert monitor.check_world(end - 0.1, displace(-0.03)) == ("door is elsewhere", np.inf)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.experiments import run_experiment
+from oracle.executed import judge_executed
 
+import vkc_pin as vkc
 from vkc_pin.experiments.closed_loop import ROWS, _disturb, _Localisation
 from vkc_pin.experiments.tasks import TASKS, make_start
 from vkc_pin.planning.plan import Plan
@@ -48,13 +51,38 @@ def drawer_plan() -> Plan:
 
 
 def test_undisturbed_plan_is_executed_open_and_closed_loop(tmp_path: Path) -> None:
-    arguments = "closed-loop --trials 1 --tasks drawer --rows nothing"
+    arguments = "closed-loop --trials 1 --tasks drawer --rows nothing --save-motions"
     table, (trial,) = run_experiment(arguments, tmp_path)
     assert trial["success"] is True, trial["violations"]
     assert (trial["open"], trial["closed"]) == (True, True), trial
     assert trial["decisions"] == {"go on": trial["cycles"]}
     assert trial["closed_depth"] <= 1e-3
     assert "| nothing | drawer | 1 of 1 | 1 of 1 | 1 of 1 |" in table
+    check_oracle(tmp_path, trial)
+
+
+def check_oracle(folder: Path, trial: Mapping[str, Any]) -> None:
+    """Check that the oracle finds nothing in a real motion, and something in a changed one."""
+    path = folder / "motions" / f"{trial['key']}.npz"
+    assert judge_executed(path, trial) == []
+    real = vkc.Plan.load(path)
+    motion = real.trajectory
+    positions = motion.positions.copy()
+    positions[:, motion.names.index("drawer.slide")] *= 0.9  # misses its goal by 30 mm
+    at = real.scene.objects["drawer"].placement.translation
+    positions[motion.phases[1].first + 20, :2] = at[:2]  # the base overlaps the drawer
+    changed = dataclasses.replace(motion, positions=positions)
+    wrong = dataclasses.replace(real, trajectory=changed).save(folder / "wrong.npz")
+    found = judge_executed(wrong, trial)
+    assert ("goal", "drawer.slide") in {(one.rule, one.subject) for one in found}
+    overlaps = [one for one in found if one.rule == "overlap"]
+    assert any("drawer" in one.subject for one in overlaps)
+    # What touches an object before its place is known does not count.
+    unknown = {**trial, "object": "drawer", "object_since": None}
+    left = [one for one in judge_executed(wrong, unknown) if one.rule == "overlap"]
+    assert not any("drawer" in one.subject for one in left)
+    unknown = {**trial, "robot_since": None}
+    assert {one.rule for one in judge_executed(wrong, unknown)} == {"goal"}
 
 
 @pytest.mark.parametrize("row", ["displaced", "grasp"])

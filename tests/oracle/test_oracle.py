@@ -320,3 +320,12 @@ def test_oracle_does_not_import_the_package(plans: dict[str, Path]) -> None:
     ]
     process = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
     assert json.loads(process.stdout) == [True] * len(plans)
+
+
+@pytest.mark.parametrize("module", ["tests.oracle", "tests.oracle.executed"])
+def test_documented_commands_start(module: str) -> None:
+    """They run from a checkout, without the paths that pytest adds."""
+    command = [sys.executable, "-m", module, "--help"]
+    root = Path(__file__).parents[2]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

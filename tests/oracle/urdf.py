@@ -11,7 +11,8 @@ from typing import Any
 import coal
 import numpy as np
 import trimesh
-from helpers.assimp import read_triangles
+
+from tests.helpers.assimp import read_triangles
 
 from .plan import NotJudged
 from .poses import Poses, make_pose, rotate_rpy

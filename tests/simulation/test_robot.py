@@ -203,6 +203,10 @@ def test_robot_is_off_its_motion_at_an_obstacle_that_was_not_planned() -> None:
     assert "crate" in (contact.first, contact.second)
     assert 0.1 < contact.begin < 2.0
     assert contact.depth > 1e-5
+    assert robot.contacts(end=contact.begin) == ()
+    (later,) = robot.contacts(begin=contact.begin + 0.2)
+    assert later.begin >= contact.begin + 0.2
+    assert robot.contacts(begin=5.0) == ()
 
 
 def test_later_motion_takes_over_and_earlier_one_goes_on_until_then() -> None:
@@ -250,6 +254,8 @@ def test_held_object_stays_in_the_hand_until_it_is_released() -> None:
     robot.wait(2.7)
     assert robot.grasped_poses[-1].time < 2.51
     assert robot.grips[0].end == pytest.approx(2.5)
+    before, after = (robot.object_states(time)["stick"].placement for time in (0.15, 1.25))
+    assert after.translation[0] - before.translation[0] == pytest.approx(0.2, abs=0.01)
     height = robot.object_states()["stick"].placement.translation[2]
     assert height < scene.objects["stick"].placement.translation[2] - 0.05
 

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+import coal
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -25,6 +26,7 @@ from helpers.expected_errors import expect_error
 
 import vkc_pin as vkc
 from vkc_pin import Options, Scene, Trajectory, Violation, validate
+from vkc_pin.utils.arrays import Floats
 from vkc_pin.validation import RemainingCheck
 from vkc_pin.validation.samples import Samples
 from vkc_pin.world.collision.distances import count_distance_queries
@@ -54,6 +56,26 @@ def validate_pairs(
     """Return constraint and pair → amount [m] of the collisions that `validate` finds."""
     report = validate(scene, steps, motion, options)
     return list_amounts([one for one in report.violations if one.constraint in CONSTRAINTS])
+
+
+def measure_distance(scene: Scene, obstacle: str, configuration: Floats) -> float:
+    """Return the distance of the robot to an obstacle [m]; negative: they overlap."""
+    robot = scene.robot
+    data = robot.model.createData()
+    pin.forwardKinematics(robot.model, data, robot.coordinates.q(configuration))
+    (number,) = [k for k, label in enumerate(scene.obstacle_labels) if label == obstacle]
+    wall = scene.obstacles[number]
+    at = coal.Transform3s(wall.placement.rotation, wall.placement.translation)
+    request, result = coal.DistanceRequest(), coal.DistanceResult()
+    request.enable_signed_distance = True
+    smallest = np.inf
+    for shape in robot.collision.geometryObjects:
+        placement = data.oMi[shape.parentJoint] * shape.placement
+        there = coal.Transform3s(placement.rotation, placement.translation)
+        result.clear()
+        distance = coal.distance(shape.geometry, there, wall.geometry, at, request, result)
+        smallest = min(smallest, distance)
+    return smallest
 
 
 def assert_same(found: Sequence[Violation], expected: dict[tuple[str, str], float]) -> None:
@@ -276,3 +298,28 @@ def test_invalid_arguments_are_refused(
     far = dataclasses.replace(drive, positions=1e3 * drive.positions)
     with expect_error("too long to be checked", field="trajectory"):
         RemainingCheck(scene, [vkc.GoTo(0.0, 0.0)], far)
+
+
+def test_first_collision_comes_before_the_deepest_one(
+    crossing: tuple[Scene, Trajectory],
+) -> None:
+    """A drive through a thick wall: the base meets it with its front, and goes on into it."""
+    scene, drive = crossing
+    options = Options()
+    check = RemainingCheck(scene, [vkc.GoTo(2.0, 3.0)], drive, options)
+    wall = describe_box("wall", [3.0, 0.4, 0.5], [2.7, 0.0, 0.5])
+    document = {**scene.document, "obstacles": [*scene.document["obstacles"], wall]}
+    changed = Scene.from_document(document, scene.folder)
+    samples = Samples(scene, drive).times
+    distances = np.array([measure_distance(changed, "wall", drive.at(time)) for time in samples])
+    is_waypoint = np.isin(samples, drive.times)
+    required = np.where(is_waypoint, options.dist_safe - 2e-3, 0.0)
+    expected = float(samples[np.flatnonzero(distances < required)[0]])
+    assert check.find_first_time(changed) == pytest.approx(expected, abs=1e-9)
+    (deepest, *_) = check.find_violations(changed)
+    assert deepest.time > expected + 0.5
+    assert check.find_first_time(changed, expected + 0.1) == pytest.approx(expected + 0.1, abs=0.02)
+    assert check.find_first_time(scene) == np.inf
+    behind = float(drive.times[-1])
+    beside = scene.with_obstacle("person", make_pose(-4.0, -4.0))
+    assert check.find_first_time(beside, behind) == np.inf

@@ -11,7 +11,9 @@ from vkc_pin.execution.robots import RobotState
 from vkc_pin.planning.plan import Plan
 from vkc_pin.utils.arguments import check_number
 from vkc_pin.validation.remaining import RemainingCheck
+from vkc_pin.world.scene.placed_object import make_world_shapes
 from vkc_pin.world.scene.scene import Scene
+from vkc_pin.world.trajectory.world_model import find_phase_at
 
 # Displacement of an object from which on the motion to it is planned again [m], [rad]: validation
 # accepts 1 mm at a grasp, and 2 mrad are 2 mm at a lever of a metre.
@@ -44,20 +46,44 @@ class Monitor:
                 they are unknown.
 
         Returns:
-            Also the time of the motion at which an obstacle is first too near [s]; inf without.
+            Also the time of the motion at which an obstacle, or an object that is elsewhere, is
+            first too near [s]; inf without.
         """
         if scene is None:
             return "", np.inf
         moved = self._find_moved_object(scene)
-        if moved:
-            return f"{moved} is elsewhere", np.inf
         # Objects that are where the plan has them, to within tolerances, are there exactly.
-        scene = replace(scene, objects=self.plan.scene.objects)
-        violations = self._check.find_violations(scene, time)
+        known = replace(scene, objects=self.plan.scene.objects)
+        if moved:
+            known = self._add_moved_object(known, scene, moved, time)
+            return f"{moved} is elsewhere", self._check.find_first_time(known, time)
+        violations = self._check.find_violations(known, time)
         if not violations:
             return "", np.inf
-        first = min(violations, key=lambda violation: violation.time)
-        return first.subject, first.time
+        return violations[0].subject, self._check.find_first_time(known, time)
+
+    def _add_moved_object(self, known: Scene, scene: Scene, name: str, time: float) -> Scene:
+        """Return a scene that has an object, where it is now, among its obstacles.
+
+        Not one in the hand, which is always near.
+
+        Args:
+            known: Scene to which it is added.
+            scene: Scene that has it where it is.
+            name: The object.
+            time: Time of the motion [s].
+        """
+        motion = self.plan.trajectory
+        holds = find_phase_at(motion, time).holds
+        if name in [hold.object for hold in holds]:
+            return known
+        state = self.plan.scene_at(time).objects[name].state
+        shapes = make_world_shapes(replace(scene.objects[name], state=state))
+        return replace(
+            known,
+            obstacles=(*known.obstacles, *shapes),
+            obstacle_labels=(*known.obstacle_labels, *[name] * len(shapes)),
+        )
 
     def check_tracking(self, time: float, state: RobotState) -> str:
         """Return how the robot is off its motion at a time of the motion [s]; "" if it is not."""

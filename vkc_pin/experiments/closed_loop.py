@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Unpack
 
-import coal
 import numpy as np
 import pinocchio as pin
 
-from vkc_pin.errors import InputError
 from vkc_pin.execution.loop import execute
-from vkc_pin.execution.record import ExecutionResult
 from vkc_pin.execution.robots import LocalisedRobot, Robot
+from vkc_pin.experiments.closed_loop_verdict import Knowledge, Person, judge_execution
 from vkc_pin.experiments.harness import runner
 from vkc_pin.experiments.harness.record import Record, trial, values
 from vkc_pin.experiments.harness.runner import LIMITS, Execution, describe_limit
@@ -70,13 +69,12 @@ _ROOM = 0.8
 _HEIGHT = 1.6  # [m]
 _AWAY = -5.0  # [m], height of an obstacle below the floor, where it touches nothing
 _NOTICE = 1.0  # [m] from the hand to its grasp at which an object is seen
-_FAR = 1.5  # [m] from a person to the origin of a shape; none is larger
 _BRAKING = 1.5  # [m] from the base's origin at which something may appear
 _DRAWS = 20  # of places
+_BEGIN = 0.05  # [s], when motions of the open loop begin
+_REST = 1.0  # [s] after the end of a motion, before it is judged
+_SAME = 1e-6  # [m], [rad] between equal placements
 _FEW = {**LIMITS, "max_evaluations": 200_000}  # limits of a motion round it
-_MOVING = 0.02  # [m/s] or [rad/s]; slower, a robot stands, and who walks into it does so himself
-_REACHED = {"m": 0.01, "rad": 0.02}  # accepted miss of a goal, as in `execution`
-_DEEPEST = 1e-3  # [m] of collisions that count as none
 _AXIS_SHIFT = 0.03  # [m]
 _AXIS_TURN = np.radians(5.0)
 _LINK_NOISE = (0.001, float(np.radians(0.3)))  # of a camera: position [m] and rotation [rad]
@@ -98,6 +96,7 @@ class Disturbance:
     Attributes:
         actual: The scene as it really is, at the start.
         observe: Updates a scene as the robot sees the world: (scene, robot) → scene.
+        displaced: Object that is elsewhere; "" if none is.
         obstacle: Time [s] → centre of the moving obstacle, shape (3,); None without one.
         offset, drift: See `SimulatedRobot`.
         landmarks: Places, shape (3,) each, near which the robot sees where it is.
@@ -105,6 +104,7 @@ class Disturbance:
 
     actual: Scene
     observe: Observation
+    displaced: str = ""
     obstacle: Callable[[float], Floats] | None = None
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     drift: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -118,6 +118,7 @@ def run(
     seed: int = 0,
     tasks: Sequence[str] | None = None,
     rows: Sequence[str] | None = None,
+    save_motions: bool = False,
     **execution: Unpack[Execution],
 ) -> dict[str, Any]:
     """Run the experiment in the folder `out`; see `runner.run`.
@@ -128,6 +129,8 @@ def run(
         seed: Random seed of starts, planning and differences.
         tasks: Some of `TASKS`. Default: all.
         rows: Some of `ROWS`. Default: all.
+        save_motions: Whether to save how the robots really moved in the closed loop, as plans
+            `out`/motions/KEY.npz in the world as it really was.
     """
     import_mujoco()
     runner.check_positive(trials=trials)
@@ -148,8 +151,9 @@ def run(
             continue
         key = f"{list(ROWS).index(row)}/{TASKS.index(name)}/{number:04d}"
         specs.append({"key": key, "row": row, "task": name, "number": number, "seed": seed})
+    record = functools.partial(_record, motions=Path(out) / "motions" if save_motions else None)
     return runner.run(
-        specs, _record, out, settings=settings, format_results=format_results, **execution
+        specs, record, out, settings=settings, format_results=format_results, **execution
     )
 
 
@@ -183,9 +187,10 @@ def format_results(result: Mapping[str, Any]) -> str:
         "# Plans in a world that differs",
         f"{about['starts']} random starts per row and task, seed {about['seed']}, "
         f"{describe_limit(about)} each. Robots in physics are judged by their real motions: "
-        "goals within 10 mm and 0.02 rad, grasps that last, and no collision deeper than 1 mm "
-        "that the plan does not have, while they move. Time passes for the robot while "
-        "the program computes. Latencies are the median and the 95th percentile of cycles that "
+        "goals within 10 mm and 0.02 rad, grasps that last, and no collision with what was known "
+        "at that time that the motion does not have in the world of its plan, and that is deeper "
+        "than 1 mm or pushes a free object further. Time passes for the robot while the program "
+        "computes. Latencies are the median and the 95th percentile of cycles that "
         "planned again; cycles are those that kept 20 Hz.",
         "\n".join(f"- {row}: {ROWS[row]}" for row in about["rows"]),
         format_table(["what differs", *figures], summary),
@@ -213,8 +218,13 @@ def _summarize(records: Sequence[Record]) -> list[str]:
     ]
 
 
-def _record(spec: dict[str, Any]) -> dict[str, Any]:
-    """Plan and execute a trial, open and closed loop, and return its record."""
+def _record(spec: dict[str, Any], *, motions: Path | None) -> dict[str, Any]:
+    """Plan and execute a trial, open and closed loop, and return its record.
+
+    Args:
+        spec: The trial.
+        motions: Folder for the motion of the closed loop. None: it is not saved.
+    """
     seed, row = spec["seed"], spec["row"]
     rng = np.random.default_rng([seed, list(ROWS).index(row), spec["number"]])
     radius = _ROOM if row == "person" else _WIDTH
@@ -226,16 +236,26 @@ def _record(spec: dict[str, Any]) -> dict[str, Any]:
     if not found.success:
         return trial(found, method="VKC", seed=seed, **fields)
     disturbance = _disturb(row, found, rng)
-    robot = _make_robot(found, disturbance, spec)
-    robot.send(found.trajectory, 0.05)
-    robot.wait(0.05 + float(found.trajectory.times[-1]) + 1.0)
-    knows_from = math.inf if is_mislocalised else 0.0
-    fields |= _judge("open", found, robot, disturbance, knows_from=knows_from)
+    person = None
+    if disturbance.obstacle is not None:
+        person = Person(_PERSON, _WIDTH, _HEIGHT, disturbance.obstacle)
 
     robot = _make_robot(found, disturbance, spec)
+    robot.send(found.trajectory, _BEGIN)
+    robot.wait(_BEGIN + float(found.trajectory.times[-1]) + _REST)
+    nothing_known = Knowledge(disturbance.displaced, math.inf, math.inf if is_mislocalised else 0.0)
+    sent = [(_BEGIN, found)]
+    fields |= _describe("open", robot, *judge_execution(found, robot, sent, nothing_known, person))
+
+    robot = _make_robot(found, disturbance, spec)
+    seen_since = math.inf
 
     def observe(scene: Scene) -> Scene:
-        return disturbance.observe(scene, robot)
+        nonlocal seen_since
+        seen = disturbance.observe(scene, robot)
+        if disturbance.displaced and _is_elsewhere(seen, found.scene, disturbance.displaced):
+            seen_since = min(seen_since, robot.time)
+        return seen
 
     options: dict[str, Any] = {}
     if row == "axis":
@@ -251,17 +271,57 @@ def _record(spec: dict[str, Any]) -> dict[str, Any]:
         driver = LocalisedRobot(robot, localise, step=_TRACKING)
         options = {"tracking": _TRACKING}
     result = execute(found, driver, observe=observe, **options)
-    robot.wait(robot.time + 1.0)
-    if is_mislocalised:
-        knows_from = localise.since
-    fields |= _judge("closed", found, robot, disturbance, result, knows_from=knows_from)
+    robot.wait(robot.time + _REST)
+    localised_since = localise.since if is_mislocalised else 0.0
+    known = Knowledge(disturbance.displaced, seen_since, localised_since)
+    reasons, depth = judge_execution(found, robot, result.plans, known, person)
+    if not result.success:
+        reasons.insert(0, result.reason)
+    fields |= _describe("closed", robot, reasons, depth)
+    if motions is not None:
+        path = motions / f"{spec['key']}.npz"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _make_executed_plan(found, robot, disturbance.actual).save(path)
     fields |= {
+        "recorded_since": float(robot.trajectory().times[0]),
+        "object": known.object,
+        "object_since": seen_since if math.isfinite(seen_since) else None,
+        "robot_since": localised_since if math.isfinite(localised_since) else None,
         "decisions": result.count_decisions(),
         "latencies": result.latencies.get("replan", []),
         "cycles": len(result.cycles),
         "late": result.late,
     }
     return trial(found, method="VKC", seed=seed, duration=found.metrics["duration"], **fields)
+
+
+def _make_executed_plan(found: Plan, robot: SimulatedRobot, actual: Scene) -> Plan:
+    """Return the real motion of a robot in the real world as a plan, which it hardly satisfies."""
+    motion = robot.trajectory()
+    motion = replace(motion, times=motion.times - motion.times[0])
+    start = motion.positions[0, : motion.robot_size]
+    scene = actual.with_start(base=start[:3], arm=start[3:], velocity={})
+    report = validate(scene, found.steps, motion, found.options)
+    status = "success" if report.ok else "rejected"
+    return Plan(scene, found.steps, found.options, motion, report, status)
+
+
+def _is_elsewhere(seen: Scene, planned: Scene, name: str) -> bool:
+    """Return whether an object is not where a scene has it."""
+    return not seen.objects[name].placement.isApprox(planned.objects[name].placement, _SAME)
+
+
+def _describe(
+    loop: str, robot: SimulatedRobot, reasons: Sequence[str], depth: float
+) -> dict[str, Any]:
+    """Return the fields of a record about an execution."""
+    return {
+        loop: not reasons,
+        f"{loop}_reason": "; ".join(reasons),
+        f"{loop}_depth": depth,
+        f"{loop}_force": max((grip.force for grip in robot.grips), default=0.0),
+        f"{loop}_torque": max((grip.torque for grip in robot.grips), default=0.0),
+    }
 
 
 def _make_robot(found: Plan, disturbance: Disturbance, spec: Mapping[str, Any]) -> SimulatedRobot:
@@ -308,10 +368,10 @@ def _disturb(row: str, found: Plan, rng: np.random.Generator) -> Disturbance:
     if row == "displaced":
         at = scene.objects[name].placement.translation
         actual = displace_object(scene, name, 0.05, np.radians(5.0), at, rng)
-        return Disturbance(actual, see_from_near)
+        return Disturbance(actual, see_from_near, name)
     if row == "grasp":
         actual = displace_object(scene, name, 0.008, np.radians(3.0), at_grasp, rng)
-        return Disturbance(actual, see_in_hand)
+        return Disturbance(actual, see_in_hand, name)
     if row == "localisation":
         angle = rng.uniform(0.0, 2.0 * np.pi)
         signs = rng.choice([-1.0, 1.0], 2)
@@ -474,7 +534,7 @@ def _obstruct(row: str, found: Plan, closing: float, rng: np.random.Generator) -
     def walk(clock: float) -> Floats:
         return np.array([*(place + across * speed * (clock - crosses)), _HEIGHT / 2])
 
-    return Disturbance(found.scene, _see_obstacle(walk), walk)
+    return Disturbance(found.scene, _see_obstacle(walk), obstacle=walk)
 
 
 def _appear(found: Plan, closing: float, rng: np.random.Generator) -> Disturbance:
@@ -504,7 +564,7 @@ def _appear(found: Plan, closing: float, rng: np.random.Generator) -> Disturbanc
     def stand(clock: float) -> Floats:
         return np.array([*place, _HEIGHT / 2 if clock >= appears else _AWAY])
 
-    return Disturbance(found.scene, _see_obstacle(stand), stand)
+    return Disturbance(found.scene, _see_obstacle(stand), obstacle=stand)
 
 
 def _see_obstacle(obstacle: Callable[[float], Floats]) -> Observation:
@@ -512,94 +572,3 @@ def _see_obstacle(obstacle: Callable[[float], Floats]) -> Observation:
         return known.with_obstacle(_PERSON, [*obstacle(robot.time), 0.0, 0.0, 0.0])
 
     return see
-
-
-def _judge(
-    loop: str,
-    found: Plan,
-    robot: SimulatedRobot,
-    disturbance: Disturbance,
-    result: ExecutionResult | None = None,
-    *,
-    knows_from: float,
-) -> dict[str, Any]:
-    """Judge the motion of a robot and its contacts, those from the time on when it is localised."""
-    reasons = []
-    if result is not None and not result.success:
-        reasons.append(result.reason)
-    reasons += _find_misses(found, robot)
-    reasons += [grip.problem for grip in robot.grips if grip.problem]
-    contacts = [
-        contact for contact in robot.contacts(disturbance.actual) if contact.time >= knows_from
-    ]
-    depth = max((contact.depth for contact in contacts), default=0.0)
-    reasons += [str(contact) for contact in contacts if contact.depth > _DEEPEST]
-    if disturbance.obstacle is not None:
-        overlap = _measure_depth(found.scene, robot, disturbance.obstacle)
-        depth = max(depth, overlap)
-        if overlap > _DEEPEST:
-            reasons.append(f"overlaps the {_PERSON} by {1e3 * overlap:.1f} mm")
-    return {
-        loop: not reasons,
-        f"{loop}_reason": "; ".join(reasons),
-        f"{loop}_depth": depth,
-        f"{loop}_force": max((grip.force for grip in robot.grips), default=0.0),
-        f"{loop}_torque": max((grip.torque for grip in robot.grips), default=0.0),
-    }
-
-
-def _find_misses(found: Plan, robot: SimulatedRobot) -> list[str]:
-    """Return by how much the goals of a task's only step are missed, where they are."""
-    step = found.steps[0]
-    states = robot.object_states()
-    missed = []
-    if isinstance(step, Actuate):
-        item = found.scene.objects[step.object].object
-        for joint, value in step.joints.items():
-            unit = item.coordinates.units[item.coordinates.index(joint)]
-            miss = abs(states[step.object].joints[joint] - value)
-            if miss > _REACHED[unit]:
-                missed.append(f"{step.object}.{joint} misses its goal by {miss:.3g} {unit}")
-    elif isinstance(step, Place):
-        goal = found.end_scene().objects[step.object].placement
-        there = states[step.object].placement
-        miss = float(np.linalg.norm(there.translation - goal.translation))
-        if miss > _REACHED["m"]:
-            missed.append(f"{step.object} misses its place by {miss:.3g} m")
-    else:
-        raise InputError("cannot be judged", field="steps", got=repr(step))
-    return missed
-
-
-def _measure_depth(
-    scene: Scene, robot: SimulatedRobot, obstacle: Callable[[float], Floats]
-) -> float:
-    """Return how deep the robot, while it moved, was in a moving cylinder [m]."""
-    model, shapes = scene.robot.model, scene.robot.collision.geometryObjects
-    data = model.createData()
-    solid = coal.Cylinder(_WIDTH, _HEIGHT)
-    request, answer = coal.DistanceRequest(), coal.DistanceResult()
-    request.enable_signed_distance = True
-    motion = robot.trajectory()
-    positions = motion.positions[:, : motion.robot_size]
-    speeds = np.abs(np.diff(positions, axis=0)).max(axis=1) / np.diff(motion.times)
-    deepest = 0.0
-    for number in np.flatnonzero(speeds > _MOVING).tolist():
-        centre = obstacle(float(motion.times[number]))
-        q = scene.robot.coordinates.q(positions[number])
-        pin.forwardKinematics(model, data, q)
-        for shape in shapes:
-            placement = data.oMi[shape.parentJoint] * shape.placement
-            if np.linalg.norm(placement.translation[:2] - centre[:2]) > _FAR:
-                continue
-            answer.clear()
-            distance = coal.distance(
-                shape.geometry,
-                coal.Transform3s(placement.rotation, placement.translation),
-                solid,
-                coal.Transform3s(np.eye(3), centre),
-                request,
-                answer,
-            )
-            deepest = max(deepest, -distance)
-    return deepest

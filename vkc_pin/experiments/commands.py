@@ -107,8 +107,10 @@ def _add_closed_loop(benches: Any) -> None:
     add_count(parser, "--trials", 20, "random starts per row and task")
     tasks = "door corridor_door drawer household_refrigerator household_cabinet household_cup"
     add_choice(parser, "tasks", f"{tasks} (default: all)")
-    rows = "nothing displaced obstacle person localisation grasp"
+    rows = "nothing displaced obstacle person localisation grasp axis"
     add_choice(parser, "rows", f"{rows} (default: all)")
+    about = "save how the robots really moved, as plans"
+    parser.add_argument("--save-motions", action="store_true", help=about)
 
 
 def add_experiment(

@@ -281,9 +281,17 @@ class SimulatedRobot:
         """Grasps so far and their largest loads."""
         return tuple(self._stepper.grips.grips)
 
-    def object_states(self) -> dict[str, ObjectState]:
-        """Return object → joint values and placement as they really are now."""
+    def object_states(self, time: float | None = None) -> dict[str, ObjectState]:
+        """Return object → joint values and placement as they really are.
+
+        Args:
+            time: Time that is over [s], of which the next recorded state counts. Default: now.
+        """
         row = self._stepper.physical.from_qpos(self._stepper.data.qpos)
+        if time is not None:
+            number = int(np.searchsorted(self._recording.times, time))
+            if number < len(self._recording.times):
+                row = self._recording.rows[number]
         return self._recording.get_object_states(row)
 
     def trajectory(self) -> Trajectory:
@@ -315,18 +323,28 @@ class SimulatedRobot:
             self._size,
         )
 
-    def contacts(self, scene: Scene | None = None) -> tuple[Contact, ...]:
+    def contacts(
+        self, scene: Scene | None = None, *, begin: float = -np.inf, end: float = np.inf
+    ) -> tuple[Contact, ...]:
         """Return the contacts so far that the motions do not have.
 
         Args:
             scene: Scene to which the motions are compared, such as that with the placements that
                 were observed. Default: the robot's.
+            begin: Time from which on contacts and motions count [s].
+            end: Time until which they do [s].
         """
         known = self._scene if scene is None else check_instance(scene, Scene, "scene")
-        samples = self._stepper.contact_samples
-        if not samples:
+        samples = dict[tuple[str, str], list[tuple[float, float]]]()
+        for pair, every in self._stepper.contact_samples.items():
+            own = [(time, depth) for time, depth in every if begin <= time < end]
+            if own:
+                samples[pair] = own
+        times = self._recording.times
+        times = times[(times >= begin) & (times < end)]
+        if not samples or len(times) < 2:
             return ()
-        planned = self._reference.make_trajectory(World(known), self._recording.times)
+        planned = self._reference.make_trajectory(World(known), times)
         return find_unplanned_contacts(known, planned, samples, _RECORD_PERIOD)
 
     @contextlib.contextmanager

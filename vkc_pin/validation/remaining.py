@@ -12,7 +12,7 @@ import pinocchio as pin
 from vkc_pin.errors import InputError, format_value
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import check_instance, check_number
-from vkc_pin.validation.clearance import ClearanceCheck
+from vkc_pin.validation.clearance import ClearanceCheck, ClearanceResult
 from vkc_pin.validation.report import Violation, select_worst
 from vkc_pin.validation.tolerances import Tolerances
 from vkc_pin.validation.validate import check_arguments
@@ -107,20 +107,46 @@ class RemainingCheck:
             InputError: Something else than obstacles differs from the prepared scene, such as the
                 placement of an object, which needs a new plan; or `time` is not a number.
         """
+        found = self._check_changed(scene, time, deepest_only=True)
+        return () if found is None else select_worst(found.violations)
+
+    def find_first_time(self, scene: Scene, time: float = 0.0) -> float:
+        """Find when the remaining motion first collides with an obstacle that has changed.
+
+        A violation's own time is that of its deepest point, which comes later.
+
+        Args:
+            scene: See `find_violations`.
+            time: See `find_violations` [s].
+
+        Returns:
+            Time of the first sample at which there is a violation [s]; inf without any.
+
+        Raises:
+            InputError: See `find_violations`.
+        """
+        found = self._check_changed(scene, time, deepest_only=False)
+        if found is None or found.first_row is None:
+            return np.inf
+        return float(self._samples.times[found.first_row])
+
+    def _check_changed(
+        self, scene: Scene, time: float, *, deepest_only: bool
+    ) -> ClearanceResult | None:
+        """Check the obstacles that have changed; None without any."""
         check_instance(scene, Scene, "scene")
         time = check_number(time, "time", "a time [s]")
         self._check_unchanged(scene)
         changed = _find_changed_obstacles(self._scene, scene)
         if not changed:
-            return ()
+            return None
         alone = dataclasses.replace(
             scene,
             obstacles=tuple(scene.obstacles[k] for k in changed),
             obstacle_labels=tuple(scene.obstacle_labels[k] for k in changed),
         )
         row = int(np.searchsorted(self._samples.times, time, side="right")) - 1
-        found = self._clearance.check_obstacles(alone, max(row, 0))
-        return select_worst(found.violations)
+        return self._clearance.check_obstacles(alone, max(row, 0), deepest_only=deepest_only)
 
     def _check_unchanged(self, scene: Scene) -> None:
         """Check that a scene differs from the prepared one in its obstacles alone."""

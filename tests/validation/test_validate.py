@@ -246,6 +246,8 @@ def test_latch_releases_the_hinge_only_with_the_knob_turned(
         ([0.0, 0.0, 0.3], [0.0, 0.4, 0.4], 0.1),
         ([0.0, 0.0, 0.3], [0.0, 0.4995, 0.4995], 5e-4),
         ([0.0, 0.0, 5e-4], [0.0, 0.0, 0.0], 0.5),
+        ([0.0, 0.0, 1.3e-4], [0.0, 0.0, 0.0], 0.5),
+        ([0.0, 0.0, 0.7e-4], [0.0, 0.0, 0.0], 0.0),  # within the tolerance of a latch
         ([0.3, -0.305, -0.305], [0.0, 0.0, 0.0], 0.5),
         ([0.0, 0.0, 0.3], [0.0, 0.5, 0.5], 0.0),
         ([0.0, 0.0, 0.3], [0.0, 0.51, 0.0], 0.0),
@@ -415,6 +417,16 @@ def test_clearance_is_checked_from_the_first_waypoint_on() -> None:
         report = validate(scene, [vkc.GoTo(end, 0.0)], make_trajectory(scene, rows, dt=1.0))
         found = [(one.constraint, one.waypoint, one.amount) for one in report.violations]
         assert found == [("clearance", 1, pytest.approx(a, abs=1e-5)) for a in amounts]
+
+
+def test_each_phase_has_its_own_clearance() -> None:
+    """A drive towards a crate in two phases: each is nearest at its end."""
+    scene, _ = make_drive_to_a_crate(0.03)
+    stops = [move_start(scene.start, x=x) for x in (0.97, 1.0)]
+    drive = drive_through(scene, scene.start, *stops, steps=8)
+    report = validate(scene, [vkc.GoTo(1.0, 0.0)], drive)
+    assert report.ok
+    assert report.clearances == pytest.approx((0.06, 0.03), abs=1e-5)
 
 
 def test_links_of_the_robot_keep_self_distance(hall: Scene, drive: Trajectory) -> None:

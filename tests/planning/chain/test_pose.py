@@ -57,6 +57,11 @@ def compute_violation(kind: str, placement: pin.SE3, target: pin.SE3) -> float:
     return float(np.maximum(lower - rows, rows - upper).max())
 
 
+def compute_rotation_size(kind: str, placement: pin.SE3, target: pin.SE3) -> float:
+    """Return the norm of the rows that belong to the rotation."""
+    return float(np.linalg.norm(evaluate(RESIDUALS[kind], placement, target)[3:]))
+
+
 def sample_axis(rng: np.random.Generator) -> np.ndarray:
     axis = rng.normal(size=3)
     return axis / np.linalg.norm(axis)
@@ -95,6 +100,12 @@ def test_residuals_and_violations_vanish_only_at_the_target(kind: str, angle: fl
             assert compute_violation(kind, placement, target) < 1e-12
         else:
             assert size > min(0.5 * angle, 0.1)
+            if kind != "point":
+                of_rotation = (
+                    size if kind == "level" else compute_rotation_size(kind, placement, target)
+                )
+                expected = 2.0 * np.sin(abs(angle) / 2.0)
+                assert of_rotation == pytest.approx(expected, rel=1e-3, abs=1e-5)
             assert compute_violation(kind, placement, target) > min(0.3 * angle, 0.1)
 
 

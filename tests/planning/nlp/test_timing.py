@@ -127,3 +127,17 @@ def test_cubic_with_velocities_at_its_ends_keeps_the_limits(seed: int) -> None:
     strongest = [6.0 * change / T**2 - (4.0 * begin + 2.0 * end) / T]
     strongest.append(-6.0 * change / T**2 + (2.0 * begin + 4.0 * end) / T)
     assert (np.abs(strongest) <= limits[1]).all()
+
+
+@pytest.mark.parametrize(("needed", "violation"), [(0.1, -0.5), (0.2, 0.0), (0.5, 1.5)])
+def test_steps_take_as_long_as_they_need_for_other_reasons(needed: float, violation: float) -> None:
+    """Such as wheels, whose speed is limited, too."""
+    dt = np.full(2, 0.2)
+    limits = (np.full(1, 1e3), np.full(1, 1e3))
+    timing = Timing(dt, dt, [(0, 2)], limits, np.zeros((2, 1)))
+    steps = np.zeros((2, 1))
+    changes = np.zeros((3, 1))
+    found = timing.compute_violation(steps, changes, np.array([0.1, needed]))
+    assert found == pytest.approx(violation)
+    stretched = timing.stretch(steps, changes, np.array([0.1, needed]))
+    assert (stretched.dt > 1.01 * dt).all() == (violation > 0.0)

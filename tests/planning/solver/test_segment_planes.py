@@ -21,6 +21,7 @@ from vkc_pin.planning.solver.segment_planes import (
     REFINEMENT_RANGE,
     SEGMENT_MARGIN,
     Crossing,
+    _select_deepest,
     find_crossings,
     find_new_crossings,
     find_segment_contacts,
@@ -232,3 +233,24 @@ def test_stationary_segments_have_no_contacts() -> None:
     problem, _ = make_post_case()
     found = find_segment_contacts(problem, problem.still)
     assert (len(found.contacts.waypoint), found.is_free, found.crossings) == (0, True, [])
+
+
+def test_deepest_contact_is_kept_for_each_segment_and_pair() -> None:
+    """Neither pairs with a shape in common nor segments beside each other are confused."""
+    segment = np.array([1, 1, 2, 2, 1])
+    pair = np.array([[5, 8], [5, 9], [5, 8], [5, 7], [4, 8]])
+    count = 2 * len(pair)
+    vectors = np.zeros((count, 3))
+    found = Contacts(
+        waypoint=np.tile(np.arange(len(segment)), 2),
+        pair=np.tile(pair, (2, 1)),
+        distance=np.concatenate([np.full(len(pair), 0.01), np.full(len(pair), -0.02)]),
+        margin=np.zeros(count),
+        normal=vectors,
+        first=vectors,
+        second=vectors,
+    )
+    kept = _select_deepest(found, segment)
+    assert len(kept.waypoint) == len(pair)
+    assert set(kept.waypoint.tolist()) == set(range(len(pair)))
+    np.testing.assert_array_equal(kept.distance, -0.02)

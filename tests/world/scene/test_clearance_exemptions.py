@@ -16,6 +16,9 @@ from hypothesis import strategies as st
 
 import vkc_pin as vkc
 from vkc_pin.world.scene.clearance_exemptions import (
+    CONTACT_DEPTH,
+    NearStretch,
+    PlacedShapes,
     find_clearance_exemptions,
     find_close_pairs,
 )
@@ -300,3 +303,18 @@ def test_exemption_applies_to_shapes_not_links(tmp_path: Path) -> None:
     (hit,) = (found for found in report.violations if found.constraint == "penetration")
     assert hit.subject == "door.leaf – wall"
     assert hit.amount == pytest.approx(0.161, abs=0.002)
+
+
+@pytest.mark.parametrize(("deepest", "is_allowed"), [(0.035, True), (0.06, False)])
+def test_leaf_gets_deeper_by_its_own_thickness(
+    tmp_path: Path, deepest: float, is_allowed: bool
+) -> None:
+    """Not by that of its post, which is 100 mm thick."""
+    scene = write_post_scene(tmp_path / "scene")
+    shapes = PlacedShapes(scene, scene.objects)
+    leaf = shapes.labels.index("door.leaf")
+    post = shapes.labels.index("wall")
+    turning = NearStretch(-np.inf, np.inf, nearest=-deepest, farthest=-0.001, turns=True)
+    for pair in ((leaf, post), (post, leaf)):
+        depth = shapes.find_allowed_depth(*pair, -0.001, {"hinge": turning})
+        assert depth == (np.inf if is_allowed else pytest.approx(0.001 + CONTACT_DEPTH + 0.04))

@@ -126,6 +126,7 @@ SIZE, BASE = "size: [0.5, 0.4, 0.3]", "base: [0.0, 0.0, 0.5]"
         (BASE, "base: [9.0, 0.0, 0.5]", 3, "start.base[0]", "expected x from -4 to 4, got 9.0"),
         (f"  {BASE}\n", "", 2, "start.base", "missing"),
         ("arm: home", "arm: [0, 0, 0]", 4, "start.arm", "wrong number of arm joints"),
+        ("arm: home", "arm: [0, 0, 9, 0, 0, 0]", 4, "start.arm[2]", "3.14159, got 9"),
         ("arm: home", "arm: {elbow: 1}", 4, "start.arm.elbow", "did you mean 'elbow_joint'?"),
         ("arm: home", "arm: {elbow_joint: 9}", 4, "start.arm.elbow_joint", "3.14159, got 9"),
         ("arm: home", "arm: rest", 4, "start.arm", "expected home, a list of joint values"),

@@ -151,6 +151,40 @@ def test_limit_of_force_ends_a_pull(sees: bool) -> None:
     assert robot.time < 6.0
 
 
+class HamperedRobot(IdealRobot):
+    """A robot that measures 143 N once the drawer is open by 0.1 m, for two tenths of a second."""
+
+    def read(self) -> RobotState:
+        state = super().read()
+        motion = plan_drawer().trajectory
+        opens = float(motion.times[np.argmax(motion.column("drawer.slide") > 0.1)])
+        force = 143.0 if 0.0 < self.time - opens < 0.2 else 5.0
+        return RobotState(state.time, state.positions, state.velocities, force, 1.0)
+
+
+def test_mechanism_that_has_moved_is_moved_on_after_a_pull() -> None:
+    """It is not blocked, although the joint cannot be estimated yet."""
+    plan = plan_drawer()
+    robot = HamperedRobot(plan.scene, is_simulated=True)
+    result = execute(
+        plan,
+        robot,
+        force_limit=100.0,
+        patience=5.0,
+        time_limit=60.0,
+        observe_link=lambda *_: None,
+    )
+    assert result.success, result.summary()
+    counts = result.count_decisions()
+    assert (counts["brake"], counts["replan"]) == (1, 1)
+    _, last = result.plans[-1]
+    slide = last.trajectory.column("drawer.slide")
+    assert 0.05 < slide[0] < 0.25
+    assert slide[-1] == pytest.approx(0.3, abs=1e-3)
+    reason = next(cycle.reason for cycle in result.cycles if cycle.decision == "brake")
+    assert reason == "pulls against the mechanism with 143 N"
+
+
 def test_drawer_in_physics_is_opened_where_it_really_slides() -> None:
     plan = plan_drawer()
     actual = make_tilted_scene()

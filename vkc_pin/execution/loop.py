@@ -29,6 +29,7 @@ from vkc_pin.world.scene.clearance_exemptions import ACCEPTED_SHORTFALL, MODEL_E
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Step
 from vkc_pin.world.trajectory.trajectory import Trajectory
+from vkc_pin.world.trajectory.world_model import find_phase_at
 
 Observe = Callable[[Scene], Scene]
 """Updates a scene with the present placements of objects and obstacles, as far as known."""
@@ -229,7 +230,8 @@ class _Loop:
         self._settings = settings
         self._joint: JointFinding | None = None  # that the present motion does not account for
         self._pull: _Pull | None = None
-        self._pulled_to: Floats | None = None  # configuration at the end of the last pull
+        # Configuration in which the hand closed, or went on after the last pull
+        self._held_from: Floats | None = None
         self._rest: _Rest | None = None
         self._cycles = list[Cycle]()
         self._sent = list[tuple[float, Plan]]()
@@ -363,6 +365,7 @@ class _Loop:
         if now - state.time > _STALE:
             self._robot.stop()
             return "stop", f"the robot's state is {now - state.time:.2g} s old"
+        self._note_hold(now, state)
         overload = self._find_overload(state) if now >= begin else ""
         if overload and not self._pull:
             return self._brake(overload, pulls=True)
@@ -394,6 +397,14 @@ class _Loop:
         if not finding:
             return "go on", ""
         return self._react(now, finding, error)
+
+    def _note_hold(self, now: float, state: RobotState) -> None:
+        """Note where the hand closes."""
+        phase = find_phase_at(self._plan.trajectory, self._get_motion_time(now))
+        if not phase.holds:
+            self._held_from = None
+        elif self._held_from is None:
+            self._held_from = state.positions
 
     def _react(self, now: float, finding: str, error: Floats | None) -> tuple[Decision, str]:
         """Plan the rest again, or brake.
@@ -539,7 +550,7 @@ class _Loop:
         self._joint = None  # the new motion accounts for it
         if pull:
             self._pull = None
-            self._pulled_to = found.scene.start
+            self._held_from = found.scene.start
         return "replan", "from rest"
 
     def _look_from_rest(self, rest: _Rest) -> Scene:
@@ -557,13 +568,13 @@ class _Loop:
         return measure_grasps(scene)
 
     def _has_moved_on(self) -> bool:
-        """Return whether the mechanism has moved since the pull before.
+        """Return whether the mechanism has moved since the hand closed, or since the pull before.
 
-        Then the rest of the joint's error is too small to be estimated, and only adds up.
+        Then it is not blocked: the joint's error is too small to be estimated yet, and adds up.
         """
-        if self._settings.observer is None or self._pulled_to is None:
+        if self._settings.observer is None or self._held_from is None:
             return False
-        moved = np.abs(self._read().positions - self._pulled_to)
+        moved = np.abs(self._read().positions - self._held_from)
         return bool(moved.max() > self._settings.tracking)
 
 

@@ -21,7 +21,7 @@ from helpers.carrying import (
     move_base,
     solve_grasp,
 )
-from helpers.drives import drive_through, make_hall, move_start
+from helpers.drives import DT, drive_through, make_hall, move_start
 from helpers.expected_errors import expect_error
 
 import vkc_pin as vkc
@@ -315,11 +315,13 @@ def test_first_collision_comes_before_the_deepest_one(
     is_waypoint = np.isin(samples, drive.times)
     required = np.where(is_waypoint, options.dist_safe - 2e-3, 0.0)
     expected = float(samples[np.flatnonzero(distances < required)[0]])
-    assert check.find_first_time(changed) == pytest.approx(expected, abs=1e-9)
-    (deepest, *_) = check.find_violations(changed)
-    assert deepest.time > expected + 0.5
-    assert check.find_first_time(changed, expected + 0.1) == pytest.approx(expected + 0.1, abs=0.02)
-    assert check.find_first_time(scene) == np.inf
-    behind = float(drive.times[-1])
+    found = check.check(changed)
+    assert expected - DT <= found.clear_until <= expected
+    assert found.clear_until in drive.times
+    assert found.violations == check.find_violations(changed)
+    assert found.violations[0].time > expected + 0.5
+    inside = expected + 0.1
+    assert inside - DT <= check.check(changed, inside).clear_until <= inside
+    assert check.check(scene) == ((), np.inf)
     beside = scene.with_obstacle("person", make_pose(-4.0, -4.0))
-    assert check.find_first_time(beside, behind) == np.inf
+    assert check.check(beside, float(drive.times[-1])) == ((), np.inf)

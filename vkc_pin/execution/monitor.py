@@ -46,8 +46,8 @@ class Monitor:
                 they are unknown.
 
         Returns:
-            Also the time of the motion at which an obstacle, or an object that is elsewhere, is
-            first too near [s]; inf without.
+            Also the time of the motion until which neither an obstacle nor an object that is
+            elsewhere is too near [s]; inf without any.
         """
         if scene is None:
             return "", np.inf
@@ -56,11 +56,11 @@ class Monitor:
         known = replace(scene, objects=self.plan.scene.objects)
         if moved:
             known = self._add_moved_object(known, scene, moved, time)
-            return f"{moved} is elsewhere", self._check.find_first_time(known, time)
-        violations = self._check.find_violations(known, time)
-        if not violations:
+            return f"{moved} is elsewhere", self._check.check(known, time).clear_until
+        found = self._check.check(known, time)
+        if not found.violations:
             return "", np.inf
-        return violations[0].subject, self._check.find_first_time(known, time)
+        return found.violations[0].subject, found.clear_until
 
     def _add_moved_object(self, known: Scene, scene: Scene, name: str, time: float) -> Scene:
         """Return a scene that has an object, where it is now, among its obstacles.

@@ -26,12 +26,11 @@ class ClearanceResult:
     Attributes:
         smallest: Smallest distance of each phase [m]; infinite without a pair.
         exemptions: Used exemptions by the labels of their shapes.
-        first_row: First sample at which a violation was found; None without any.
     """
 
     def __init__(self, samples: Samples) -> None:
         self._samples = samples
-        self.first_row: int | None = None
+        self._first_row: int | None = None  # of a violation
         self._lasts = [phase.last for phase in samples.trajectory.phases]
         # The worst hit of each constraint and pair of links, with the amount of its violation.
         self._worst: dict[tuple[str, str, str], tuple[Hit, float]] = {}
@@ -93,12 +92,21 @@ class ClearanceResult:
         np.minimum.at(self.smallest, phases, distances)
 
     def _add_violation(self, kind: str, hit: Hit, amount: float) -> None:
-        if self.first_row is None or hit.row < self.first_row:
-            self.first_row = hit.row
+        if self._first_row is None or hit.row < self._first_row:
+            self._first_row = hit.row
         key = (kind, hit.first, hit.second)
         known = self._worst.get(key)
         if known is None or known[1] < amount:
             self._worst[key] = (hit, amount)
+
+    @property
+    def clear_until(self) -> float:
+        """Time until which nothing is violated [s]: of the last waypoint before; inf without."""
+        if self._first_row is None:
+            return np.inf
+        rows = self._samples.waypoint_rows
+        waypoint = int(np.searchsorted(rows, self._first_row)) - 1
+        return float(self._samples.times[rows[max(waypoint, 0)]])
 
     @property
     def violations(self) -> list[Violation]:
@@ -153,33 +161,21 @@ class ClearanceCheck:
         """Check all pairs of the motion."""
         return self._check(self._solids, self._moved, obstacles_only=False, first_row=0)
 
-    def check_obstacles(
-        self, scene: Scene, first_row: int, *, deepest_only: bool = True
-    ) -> ClearanceResult:
+    def check_obstacles(self, scene: Scene, first_row: int) -> ClearanceResult:
         """Check only the obstacles of another scene, from a sample to the end.
 
         Args:
             scene: The scene of the motion with the obstacles that are checked.
             first_row: First sample that is checked.
-            deepest_only: Whether overlaps between waypoints count only if they are the deepest ones
-                so far. That is quicker, but `first_row` of the result may be too late.
         """
         solids = self._solids.with_obstacles(scene)
         moved = np.zeros((len(self._moved), len(solids.world.shapes)))
         bodies = slice(solids.body_count)
         moved[:, bodies] = self._moved[:, bodies]
-        return self._check(
-            solids, moved, obstacles_only=True, first_row=first_row, deepest_only=deepest_only
-        )
+        return self._check(solids, moved, obstacles_only=True, first_row=first_row)
 
     def _check(
-        self,
-        solids: CollisionShapes,
-        moved: Floats,
-        *,
-        obstacles_only: bool,
-        first_row: int,
-        deepest_only: bool = False,
+        self, solids: CollisionShapes, moved: Floats, *, obstacles_only: bool, first_row: int
     ) -> ClearanceResult:
         samples = self._samples
         scene = solids.world.scene
@@ -207,10 +203,10 @@ class ClearanceCheck:
             for first, second in one.pairs.tolist():
                 exemptions.setdefault((first, second), []).append(one)
         have_exemptions = _are_listed(table.pairs, exemptions)
-        only_deepest = None
+        deepest_only = None
         if obstacles_only:
             # Where a pair may overlap for a while, its deepest overlap need not be a violation.
-            only_deepest = ~(table.have_windows | have_exemptions) & deepest_only
+            deepest_only = ~(table.have_windows | have_exemptions)
         result = ClearanceResult(samples)
         hits = sweep(
             table,
@@ -218,7 +214,7 @@ class ClearanceCheck:
             samples.waypoint_rows,
             moved=moved,
             first_row=first_row,
-            deepest_only=only_deepest,
+            deepest_only=deepest_only,
         )
         for found in hits:
             result.add(found, exemptions, have_exemptions)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -12,7 +12,7 @@ import pinocchio as pin
 from vkc_pin.errors import InputError, format_value
 from vkc_pin.options import Options
 from vkc_pin.utils.arguments import check_instance, check_number
-from vkc_pin.validation.clearance import ClearanceCheck, ClearanceResult
+from vkc_pin.validation.clearance import ClearanceCheck
 from vkc_pin.validation.report import Violation, select_worst
 from vkc_pin.validation.tolerances import Tolerances
 from vkc_pin.validation.validate import check_arguments
@@ -37,6 +37,18 @@ _FREE_FIELDS = {
 _FIXED_FIELDS = {field.name for field in dataclasses.fields(Scene)} - _FREE_FIELDS
 # entries of its document that may differ, or are compared one by one
 _FREE_ENTRIES = {"name", "obstacles", "objects", "start_region"}
+
+
+class RemainingResult(NamedTuple):
+    """What a check of the rest of a motion finds.
+
+    Attributes:
+        violations: See `RemainingCheck.find_violations`.
+        clear_until: Time of the last waypoint before the first violation [s]; inf without any.
+    """
+
+    violations: tuple[Violation, ...]
+    clear_until: float
 
 
 class RemainingCheck:
@@ -107,46 +119,34 @@ class RemainingCheck:
             InputError: Something else than obstacles differs from the prepared scene, such as the
                 placement of an object, which needs a new plan; or `time` is not a number.
         """
-        found = self._check_changed(scene, time, deepest_only=True)
-        return () if found is None else select_worst(found.violations)
+        return self.check(scene, time).violations
 
-    def find_first_time(self, scene: Scene, time: float = 0.0) -> float:
-        """Find when the remaining motion first collides with an obstacle that has changed.
+    def check(self, scene: Scene, time: float = 0.0) -> RemainingResult:
+        """Find these collisions, and until when there is none.
 
-        A violation's own time is that of its deepest point, which comes later.
+        A violation's own time is that of its deepest point.
 
         Args:
             scene: See `find_violations`.
             time: See `find_violations` [s].
 
-        Returns:
-            Time of the first sample at which there is a violation [s]; inf without any.
-
         Raises:
             InputError: See `find_violations`.
         """
-        found = self._check_changed(scene, time, deepest_only=False)
-        if found is None or found.first_row is None:
-            return np.inf
-        return float(self._samples.times[found.first_row])
-
-    def _check_changed(
-        self, scene: Scene, time: float, *, deepest_only: bool
-    ) -> ClearanceResult | None:
-        """Check the obstacles that have changed; None without any."""
         check_instance(scene, Scene, "scene")
         time = check_number(time, "time", "a time [s]")
         self._check_unchanged(scene)
         changed = _find_changed_obstacles(self._scene, scene)
         if not changed:
-            return None
+            return RemainingResult((), np.inf)
         alone = dataclasses.replace(
             scene,
             obstacles=tuple(scene.obstacles[k] for k in changed),
             obstacle_labels=tuple(scene.obstacle_labels[k] for k in changed),
         )
         row = int(np.searchsorted(self._samples.times, time, side="right")) - 1
-        return self._clearance.check_obstacles(alone, max(row, 0), deepest_only=deepest_only)
+        found = self._clearance.check_obstacles(alone, max(row, 0))
+        return RemainingResult(select_worst(found.violations), found.clear_until)
 
     def _check_unchanged(self, scene: Scene) -> None:
         """Check that a scene differs from the prepared one in its obstacles alone."""

@@ -13,7 +13,7 @@ import pytest
 
 import vkc_pin as vkc
 from vkc_pin.errors import InputError
-from vkc_pin.execution import ExecutionResult, IdealRobot, RobotState, execute
+from vkc_pin.execution import ExecutionResult, IdealRobot, RobotState, execute, loop
 from vkc_pin.world.trajectory.trajectory import Trajectory
 
 # The clock of simulated robots stands still while a motion is found, however slow the machine is.
@@ -135,6 +135,34 @@ def test_robot_brakes_before_a_wall_and_gives_up() -> None:
     state = robot.read()
     np.testing.assert_allclose(state.velocities, 0.0, atol=1e-9)
     check_smooth(robot, result)
+
+
+def test_searches_take_longer_after_those_that_time_has_ended(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Not after those that failed for another reason; at most as long as the patience."""
+    at = plan_door().scene.objects["door"].placement.translation
+    statuses = ["infeasible", "time limit", "infeasible", "time limit", "time limit", "time limit"]
+    limits = list[float]()
+    seeds = list[int]()
+
+    class Prepared:
+        def solve(self, *, time_limit: float, seed: int, **_: Any) -> vkc.Plan:
+            status = statuses[min(len(limits), len(statuses) - 1)]
+            limits.append(time_limit)
+            seeds.append(seed)
+            return dataclasses.replace(plan_door(), status=status)
+
+    monkeypatch.setattr(loop, "prepare", lambda *_, **__: Prepared())
+
+    def observe(scene: vkc.Scene, time: float) -> vkc.Scene:
+        pose = [at[0] - 0.4, at[1] - 0.5, 0.25, 0.0, 0.0, 0.0]
+        return scene.with_obstacle("sofa", pose) if time > 1.0 else scene
+
+    result, _ = run(observe, patience=3.0, time_limit=0.5)
+    assert not result.success
+    assert limits[:8] == [0.5, 0.5, 1.0, 1.0, 2.0, 3.0, 3.0, 3.0]
+    assert seeds == list(range(seeds[0], seeds[0] + len(seeds)))
 
 
 def test_robot_waits_for_a_free_start() -> None:

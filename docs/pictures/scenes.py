@@ -365,7 +365,7 @@ def torque_picture() -> None:
         ):
             times, _ = plan.trajectory.sample(200.0)
             torques = Torques(plan.scene, plan.trajectory)
-            limits = plan.scene.robot.efforts.limits[3:]
+            limits = plan.scene.robot.torque_limits.limits[3:]
             shares = 100.0 * torques.along(times)[:, 3:] / limits
             for name, column, limit in zip(
                 plan.scene.robot.coordinates.names[3:], shares.T, limits, strict=True

@@ -306,7 +306,9 @@ def _plan_repeatedly(
         before = budget.evaluations
         (other,) = seeds.spawn(1)
         seed = int(other.generate_state(1)[0])
-        request = dataclasses.replace(request, random_seed=seed, effort=2 * request.effort)
+        request = dataclasses.replace(
+            request, random_seed=seed, check_factor=2 * request.check_factor
+        )
         last = yield from plan_once(request)
         goes_on = budget.evaluations > before
     if last.success or last.status == "infeasible":

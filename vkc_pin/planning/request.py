@@ -58,7 +58,7 @@ class PlanningRequest:
         explains: Whether a failure has the best motion that was found, validated, and notes on its
             causes; else it has a motion that stands still. To find causes may take seconds.
         wants_draft: Whether a converged solution is returned as a `Draft`.
-        effort: Factor of the collision checks of searches with trees; see `plan`.
+        check_factor: Factor of the collision checks of searches with trees; see `plan`.
         is_tentative: Whether planning gives up if the goals of its first initial guess seem to be
             blocked, as steps before can be planned again with another grasp.
         log: Statistics and history of the call's searches; requests derived from this one share it.
@@ -72,7 +72,7 @@ class PlanningRequest:
     terms: tuple[Term, ...] = ()
     progress: Progress = field(default_factory=Progress)
     cache: Cache = field(default_factory=Cache)
-    effort: int = 1
+    check_factor: int = 1
     guess: Trajectory | None = None
     explains: bool = True
     wants_draft: bool = False

@@ -263,7 +263,7 @@ class TaskSearch:
             request.initialization,
             request.random_seed,
             count=request.options.max_restarts,
-            effort=request.effort,
+            check_factor=request.check_factor,
             perturbation=request.perturbation,
             notes=self._blocked_phases,
             is_infeasible=functools.partial(self._diagnosis.is_infeasible, problem),

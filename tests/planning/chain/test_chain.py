@@ -263,7 +263,7 @@ def compute_expected_links(
 )
 def test_objects_follow_hand_and_grasp(scene: Callable[[], Scene], holds: tuple[Hold, ...]) -> None:
     objects, chain = scene().objects, consolidate(scene(), holds)
-    for table in (chain.closures, chain.held_geometries, chain.virtual, chain.prefixes):
+    for table in (chain.closures, chain.grasped_geometries, chain.virtual, chain.prefixes):
         assert tuple(table) == holds
     for z in sample_configurations(chain.lower, chain.upper, 3, np.random.default_rng(4)):
         q, data = chain.coordinates.q(z), chain.model.createData()
@@ -278,7 +278,7 @@ def test_objects_follow_hand_and_grasp(scene: Callable[[], Scene], holds: tuple[
             assert_same(data.oMi[closure.joint] * closure.local, placed.placement)
             assert_same(closure.target, objects[hold.object].link_placement(base_link))
             expected = {shape.name: shape.placement for shape in make_world_shapes(placed)}
-            for index in chain.held_geometries[hold]:
+            for index in chain.grasped_geometries[hold]:
                 name, placement = shapes[index]
                 assert_same(placement, expected[name.rpartition(".")[2]])
                 assert chain.collision.geometryObjects[index].parentJoint > 1
@@ -309,7 +309,7 @@ def test_every_hold_has_its_own_shapes_joints_and_names() -> None:
     for named in (chain.collision.geometryObjects, chain.model.frames):
         names = [one.name for one in named]
         assert len(set(names)) == len(names)
-    indices = [index for hold in holds for index in chain.held_geometries[hold]]
+    indices = [index for hold in holds for index in chain.grasped_geometries[hold]]
     count = len(robot.collision.geometryObjects)
     assert sorted(indices) == list(range(count, len(chain.collision.geometryObjects)))
 

@@ -201,7 +201,7 @@ def load_robot_with_effort(folder: Path, effort: object) -> vkc.Robot:
 
 @pytest.mark.parametrize(("effort", "limit"), [(90.0, 90.0), (0, np.inf)])
 def test_robot_yaml_overrides_the_urdf(tmp_path: Path, effort: float, limit: float) -> None:
-    limits = load_robot_with_effort(tmp_path, effort).efforts.limits
+    limits = load_robot_with_effort(tmp_path, effort).torque_limits.limits
     assert limits.tolist() == [np.inf] * 3 + [150.0, 150.0, limit] + [28.0] * 3
 
 

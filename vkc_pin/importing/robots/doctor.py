@@ -277,7 +277,7 @@ def _check_limits(robot: Robot) -> list[Finding]:
         text = f"no effort limit: {format_names(no_effort)} (their torques are not limited)"
         hint = "`joints: {NAME: {effort: ...}}` in robot.yaml"
         findings.append(Finding("note", "effort", text, hint))
-    for note in robot.efforts.notes:
+    for note in robot.torque_limits.notes:
         # Joints without limits have been listed.
         if "no effort" not in note:
             findings.append(Finding("note", "effort", note))

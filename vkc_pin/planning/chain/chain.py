@@ -162,8 +162,8 @@ class VirtualKinematicChain:
         names: Coordinate names, shape (n,); `<object>.<joint>` or `<object>.<attachment>`.
         lower, upper, velocity, acceleration: Limits, shape (n,), SI units.
         collision: Collision geometry of the robot, then of the moving parts of objects.
-        held_geometries: Hold → indices in `collision` of the geometry that moves with it.
-        ride_geometries: Ride → indices in `collision` of the supported object's geometry.
+        grasped_geometries: Hold → indices in `collision` of the geometry that moves with it.
+        supported_geometries: Supported object → indices in `collision` of its geometry.
         closures: Hold → closure of the object's base link.
         virtual: Hold → names of the coordinates of its attachment's virtual joint.
         added: Hold → names of all its coordinates: virtual joint and object joints.
@@ -180,8 +180,8 @@ class VirtualKinematicChain:
     velocity: Floats
     acceleration: Floats
     collision: pin.GeometryModel
-    held_geometries: Mapping[Hold, tuple[int, ...]]
-    ride_geometries: Mapping[SupportedObject, tuple[int, ...]]
+    grasped_geometries: Mapping[Hold, tuple[int, ...]]
+    supported_geometries: Mapping[SupportedObject, tuple[int, ...]]
     closures: Mapping[Hold, Closure]
     virtual: Mapping[Hold, tuple[str, ...]]
     added: Mapping[Hold, tuple[str, ...]]
@@ -345,7 +345,7 @@ def consolidate(
     scene: Scene,
     holds: Iterable[Hold] | Mapping[str, str],
     *,
-    rides: Iterable[SupportedObject] = (),
+    supported: Iterable[SupportedObject] = (),
     cache: Cache | None = None,
 ) -> VirtualKinematicChain:
     """Merge the scene's robot with the objects it grasps into one model (paper, section III).
@@ -356,7 +356,7 @@ def consolidate(
         scene: Robot and placed objects.
         holds: All holds at any time, each after the hold it depends on; or object → attachment, all
             grasped by the tool. Several holds become branches of one tree.
-        rides: Objects supported by links of grasped objects at any time.
+        supported: Objects supported by links of grasped objects at any time.
         cache: Cache of the chain's kinematics. Defaults to one of its own.
 
     Raises:
@@ -378,7 +378,7 @@ def consolidate(
     )
     names = list(robot.coordinates.names)
     limits = [*_list_limits(robot).values()]
-    held_geometries = {}
+    grasped_geometries = {}
     closures = {}
     virtual = {}
     hold_coordinates = {}
@@ -421,19 +421,19 @@ def consolidate(
         geometries = graft_geometry(
             collision, moving, joints=joints, placement=placement, prefix=prefix
         )
-        held_geometries[hold] = tuple(geometries)
+        grasped_geometries[hold] = tuple(geometries)
         closures[hold] = Closure(
             joint=base.parentJoint,
             local=pin.SE3(base.placement),
             target=placed.link_placement(item.base_link),
         )
     _check_unique(names)
-    ride_geometries = {}
-    for number, supported in enumerate(rides):
-        link = model.frames[model.getFrameId(prefixes[supported.hold] + supported.link)]
-        prefix = supported.object + "^" * (number + 1) + "."
-        ride_geometries[supported] = _graft_supported_object(
-            scene, supported, collision, link, prefix
+    supported_geometries = {}
+    for number, on_top in enumerate(supported):
+        link = model.frames[model.getFrameId(prefixes[on_top.hold] + on_top.link)]
+        prefix = on_top.object + "^" * (number + 1) + "."
+        supported_geometries[on_top] = _graft_supported_object(
+            scene, on_top, collision, link, prefix
         )
     lower, upper, velocity, acceleration = np.array(limits, float).T.copy()
     return VirtualKinematicChain(
@@ -446,8 +446,8 @@ def consolidate(
         velocity=velocity,
         acceleration=acceleration,
         collision=collision,
-        held_geometries=held_geometries,
-        ride_geometries=ride_geometries,
+        grasped_geometries=grasped_geometries,
+        supported_geometries=supported_geometries,
         closures=closures,
         virtual=virtual,
         added=hold_coordinates,

@@ -300,11 +300,11 @@ def _find_lift_and_place_moments(
             if not scene.objects[hold.object].object.free:
                 continue
             placed = replace(scene.objects[hold.object], placement=placement)
-            yield chain.held_geometries[hold], placed, begins
+            yield chain.grasped_geometries[hold], placed, begins
             for supported in phase.supported:
                 if supported.hold == hold:
                     placed_on_it = _place_supported_object(scene, supported, placed)
-                    yield chain.ride_geometries[supported], placed_on_it, begins
+                    yield chain.supported_geometries[supported], placed_on_it, begins
     for supported in phase.supported:
         carrier = scene.objects[supported.hold.object]
         if carrier.object.free:
@@ -313,7 +313,7 @@ def _find_lift_and_place_moments(
         for values, begins in ((phase.initial_values, True), (final_values, False)):
             carrier_then = carrier.with_state(_select_joint_values(values, carrier.name))
             placed_on_it = _place_supported_object(scene, supported, carrier_then)
-            yield chain.ride_geometries[supported], placed_on_it, begins
+            yield chain.supported_geometries[supported], placed_on_it, begins
 
 
 def _predict_final_values(phase: Phase, placed: PlacedObject) -> dict[str, float]:
@@ -367,7 +367,7 @@ class _PairBuilder:
         geometries = chain.collision.geometryObjects
         self._robot_geometries = range(len(scene.robot.collision.geometryObjects))
         self._labels = [scene.robot.link_of(i) for i in self._robot_geometries]
-        for moved in (chain.held_geometries, chain.ride_geometries):
+        for moved in (chain.grasped_geometries, chain.supported_geometries):
             for hold_or_supported, indices in moved.items():
                 for i in indices:
                     link = get_link_name(get_local_name(geometries[i].name))
@@ -396,7 +396,7 @@ class _PairBuilder:
         attached_shapes: dict[str, tuple[int, ...]] = {}
         moving = list(self._robot_geometries)
         for hold in phase.held:
-            grasped = chain.held_geometries[hold]
+            grasped = chain.grasped_geometries[hold]
             attached_shapes[hold.object] = grasped
             for i, j in itertools.product(moving, grasped):
                 pairs.append((i, j, self._get_attached_margin(hold, labels[i], labels[j])))
@@ -405,7 +405,7 @@ class _PairBuilder:
                     pairs.append((i, j, margin))
             moving += grasped
         for supported in phase.supported:
-            on_it = chain.ride_geometries[supported]
+            on_it = chain.supported_geometries[supported]
             attached_shapes[supported.object] = on_it
             # The object moves rigidly with geometry on these joints.
             same_joint = {shapes[j].parentJoint for j in on_it}

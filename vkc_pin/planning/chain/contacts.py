@@ -172,9 +172,9 @@ class ContactModel:
         """Return the geometries of grasped objects in a phase and of objects supported by them."""
         geometries = list[int]()
         for hold in self.task.phases[phase].held:
-            geometries += self.chain.held_geometries[hold]
+            geometries += self.chain.grasped_geometries[hold]
         for supported in self.task.phases[phase].supported:
-            geometries += self.chain.ride_geometries[supported]
+            geometries += self.chain.supported_geometries[supported]
         return geometries
 
     def find_phase(self, waypoint: int) -> int:

@@ -71,11 +71,13 @@ class CurvePaths:
 class RrtPaths:
     """Paths of base and arm by RRT: guided by a base path, or constrained to a closed chain."""
 
-    def __init__(self, sampler: KeyframeSampler, routes: BaseRoutes, *, effort: int = 1) -> None:
+    def __init__(
+        self, sampler: KeyframeSampler, routes: BaseRoutes, *, check_factor: int = 1
+    ) -> None:
         self.sampler = sampler
         self.problem = sampler.problem
         self.routes = routes
-        self.effort = effort  # factor of the collision checks
+        self.check_factor = check_factor  # factor of the collision checks
         self._failures: Counter[int] = Counter()  # consecutive ones per phase
         # Configurations at which the motion may end, shape (E, n).
         self.final_ends = np.empty((0, self.problem.chain.size))
@@ -113,7 +115,7 @@ class RrtPaths:
         # Every other attempt allows no shortfall, and pairs of attempts get twice the checks.
         failures = self._failures[phase]
         allowed = 0.0 if failures % 2 else problem.options.dist_safe
-        max_checks = self.effort * FIRST_CHECKS * 2 ** (failures // 2)
+        max_checks = self.check_factor * FIRST_CHECKS * 2 ** (failures // 2)
         search = OpenSearch(self.sampler, phase, first, ends, guide, allowed=allowed)
         path = search.find_path(steps, max_checks)
         self._count_failures(phase, path)

@@ -39,7 +39,7 @@ def initialize(
     random_seed: int,
     *,
     count: int = 1,
-    effort: int = 1,
+    check_factor: int = 1,
     perturbation: float = 0.0,
     notes: list[str] | None = None,
     is_infeasible: Callable[[Sequence[int]], bool] = lambda _: False,
@@ -57,7 +57,7 @@ def initialize(
             arm that two random trees find. "auto": these three, interleaved.
         random_seed: Random seed.
         count: Maximum number of guesses per method.
-        effort: Factor of the collision checks of searches with trees.
+        check_factor: Factor of the collision checks of searches with trees.
         perturbation: Standard deviation of smooth noise on the robot's coordinates [m] or [rad].
         notes: List that receives a line for every phase without a base path.
         is_infeasible: Called by "auto" before trees grow, with the numbers of the phases at whose
@@ -76,7 +76,7 @@ def initialize(
             notes,
             BaseRoutes(problem),
             KeyframeCache(),
-            effort,
+            check_factor,
         )
         if method == "auto":
             kinds = ["interpolated", "astar", "rrt"]
@@ -180,7 +180,7 @@ class _Shared:
     notes: list[str]
     routes: BaseRoutes
     cache: KeyframeCache
-    effort: int
+    check_factor: int
 
     @property
     def driving_routes(self) -> BaseRoutes | None:
@@ -321,7 +321,7 @@ class _RrtSearch(_GuessSearch):
         self.failed_directions = set[bool]()
         sampler = shared.make_sampler()
         beam = BeamSearch(sampler, shared.driving_routes, for_narrow_passages=True)
-        self.paths = RrtPaths(sampler, shared.routes, effort=shared.effort)
+        self.paths = RrtPaths(sampler, shared.routes, check_factor=shared.check_factor)
         approach = ApproachPaths(sampler, keeps_base_fixed=True)
         return beam, Interpolator(sampler, approach, self.paths)
 

@@ -62,7 +62,7 @@ class KinematicProblem:
         self.options = options
         self.cache = cache or Cache()
         self.chain: VirtualKinematicChain = consolidate(
-            scene, task.holds, rides=task.supported, cache=self.cache
+            scene, task.holds, supported=task.supported, cache=self.cache
         )
         self.rolling = make_rolling_limits(self.chain.robot)
         self.contacts = ContactModel(scene, self.chain, task, options)

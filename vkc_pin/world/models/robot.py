@@ -165,7 +165,7 @@ class Robot:
         return unwrapped
 
     @cached_property
-    def efforts(self) -> TorqueLimits:
+    def torque_limits(self) -> TorqueLimits:
         """Torque limits of the joints, as far as the description is plausible."""
         return compute_torque_limits(self.model, self.coordinates, self.lower, self.upper)
 

@@ -241,7 +241,7 @@ class Torques:
         self.scene = scene
         self.trajectory = trajectory
         self._free = FreeObjects(scene, trajectory) if free is None else free
-        self.torque_limits: TorqueLimits = scene.robot.efforts
+        self.torque_limits: TorqueLimits = scene.robot.torque_limits
         self._loads: dict[int, _Load] = {}
 
     def at(

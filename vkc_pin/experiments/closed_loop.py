@@ -298,7 +298,10 @@ def _record(spec: dict[str, Any], *, motions: Path | None) -> dict[str, Any]:
 def _make_executed_plan(found: Plan, robot: SimulatedRobot, actual: Scene) -> Plan:
     """Return the real motion of a robot in the real world as a plan, which it hardly satisfies."""
     motion = robot.trajectory()
-    motion = replace(motion, times=motion.times - motion.times[0])
+    phases = []
+    for phase in motion.phases:  # measured grasps are those of the scenes of later motions
+        phases.append(replace(phase, holds=tuple(hold.nominal for hold in phase.holds)))
+    motion = replace(motion, times=motion.times - motion.times[0], phases=tuple(phases))
     start = motion.positions[0, : motion.robot_size]
     scene = actual.with_start(base=start[:3], arm=start[3:], velocity={})
     report = validate(scene, found.steps, motion, found.options)

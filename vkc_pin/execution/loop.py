@@ -17,6 +17,7 @@ from vkc_pin.execution.joint_observer import JointFinding, JointObserver, Observ
 from vkc_pin.execution.monitor import Monitor
 from vkc_pin.execution.record import Cycle, Decision, ExecutionResult
 from vkc_pin.execution.robots import Robot, RobotState, send_soon
+from vkc_pin.execution.uncertain_joints import allow_near_neighbours
 from vkc_pin.planning.plan import Plan
 from vkc_pin.planning.planner import Planner
 from vkc_pin.planning.prepare import prepare
@@ -191,7 +192,8 @@ class _Rest:
         since: When the robot has come to rest [s].
         attempts: Number of searches so far.
         timeouts: Number of these that the time limit has ended.
-        overlaps: Links that overlap where the robot stands → how deep [m].
+        margins: Links that may be nearer than usual → distance that they keep [m]; negative: how
+            deep they may overlap.
     """
 
     steps: tuple[Step, ...]
@@ -199,7 +201,7 @@ class _Rest:
     since: float = np.inf
     attempts: int = 0
     timeouts: int = 0
-    overlaps: dict[tuple[str, str], float] = field(default_factory=dict)
+    margins: dict[tuple[str, str], float] = field(default_factory=dict)
 
     def begin_again(self, since: float) -> None:
         """Count the searches from now on, since the robot brakes until then [s]."""
@@ -542,7 +544,7 @@ class _Loop:
         rest.attempts += 1
         rest.timeouts += found.status == "time limit"
         if not found.success:
-            rest.overlaps |= _find_small_overlaps(found)
+            rest.margins |= _find_small_overlaps(found)
             return "wait", found.status
         if not self._send(found):
             return "wait", "blocked meanwhile"
@@ -558,13 +560,20 @@ class _Loop:
         end = float(self._plan.trajectory.times[-1])
         scene = self._look(self._plan.scene_at(end))
         if self._joint is not None:
-            scene = self._joint.update(scene)
+            joint = self._joint
+            scene = allow_near_neighbours(
+                joint.update(scene),
+                joint.object,
+                joint.joint,
+                rest.steps,
+                self._first.options.dist_safe,
+            )
         positions = self._read().positions
         distance = float(np.abs(positions - scene.start).max())
         if self._pull or distance > self._settings.tracking:
             scene = scene.with_start(base=positions[:3], arm=positions[3:])
-        for links, depth in rest.overlaps.items():
-            scene = scene.with_allowed(*links, -depth)
+        for links, margin in rest.margins.items():
+            scene = scene.with_allowed(*links, margin)
         return measure_grasps(scene)
 
     def _has_moved_on(self) -> bool:
@@ -579,17 +588,17 @@ class _Loop:
 
 
 def _find_small_overlaps(failed: Plan) -> dict[tuple[str, str], float]:
-    """Return the links that overlap at the start of a failed plan → depth to allow [m].
+    """Return the links that overlap at the start of a failed plan → distance to allow [m].
 
     An object that is first seen while the robot brakes may overlap it a little. If any overlap is
     deeper than an error of the model, none is allowed.
     """
-    overlaps = dict[tuple[str, str], float]()
+    margins = dict[tuple[str, str], float]()
     for violation in failed.report.violations:
         if violation.constraint != "start":
             continue
         first, dash, second = violation.subject.partition(" – ")
         if not dash or violation.amount > MODEL_ERROR:
             return {}
-        overlaps[first, second] = violation.amount + ACCEPTED_SHORTFALL
-    return overlaps
+        margins[first, second] = -violation.amount - ACCEPTED_SHORTFALL
+    return margins

@@ -395,12 +395,14 @@ def test_exempt_pair_must_keep_its_own_margin(
     assert found == ([(constraint, pytest.approx(amount, abs=1e-5))] if constraint else [])
 
 
-def test_every_pair_must_keep_the_clearance_not_only_the_nearest() -> None:
+@pytest.mark.parametrize("self_distance", [0.02, 0.001])
+def test_every_pair_must_keep_the_clearance_not_only_the_nearest(self_distance: float) -> None:
     scene, _ = make_drive_to_a_crate(5e-4)
     scene = add_boxes(scene, board=((0.3, 0.02, 0.3), (1.0, -0.36, 0.15)))
     rows = np.array([scene.start, move_start(scene.start, x=1.0)])
     motion = make_trajectory(scene, rows, dt=10.0)
-    report = validate(scene, [vkc.GoTo(1.0, 0.0)], motion, Options(dist_safe=0.02))
+    options = Options(dist_safe=0.02, self_distance=self_distance)
+    report = validate(scene, [vkc.GoTo(1.0, 0.0)], motion, options)
     found = {one.subject.split(" – ")[1]: one for one in report.violations}
     assert set(found) == {"crate", "board"}
     assert {one.constraint for one in report.violations} == {"clearance"}

@@ -318,3 +318,19 @@ def test_leaf_gets_deeper_by_its_own_thickness(
     for pair in ((leaf, post), (post, leaf)):
         depth = shapes.find_allowed_depth(*pair, -0.001, {"hinge": turning})
         assert depth == (np.inf if is_allowed else pytest.approx(0.001 + CONTACT_DEPTH + 0.04))
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "farthest", "overlaps"),
+    [
+        (-np.inf, np.inf, -0.001, True),
+        (-np.inf, np.inf, 0.001, False),
+        (-1.0, np.inf, -0.001, False),
+        (-np.inf, 1.0, -0.001, False),
+    ],
+)
+def test_shapes_overlap_throughout_on_all_of_the_range(
+    lower: float, upper: float, farthest: float, overlaps: bool
+) -> None:
+    stretch = NearStretch(lower, upper, nearest=-0.01, farthest=farthest, turns=True)
+    assert stretch.overlaps_throughout is overlaps

@@ -7,7 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import vkc_pin as vkc
-from vkc_pin.world.scene.joint_estimation import DECISIVE, estimate_joint, fit_joint
+from vkc_pin.world.scene.joint_estimation import (
+    DECISIVE,
+    _compute_rotation_vectors,
+    estimate_joint,
+    fit_joint,
+)
 
 POSITION_NOISE = 0.001  # [m]
 ROTATION_NOISE = np.radians(0.3)
@@ -160,3 +165,14 @@ def test_short_motions_are_refused(turned: float, slid: float, message: str) -> 
 def test_invalid_arguments_are_named(arguments: dict[str, object], message: str) -> None:
     with pytest.raises(vkc.InputError, match=message):
         estimate_joint(**arguments)  # type: ignore[arg-type]
+
+
+def test_rotation_vectors_are_those_of_pinocchio() -> None:
+    rng = np.random.default_rng(4)
+    for angle in (0.0, 1e-9, 1e-3, 0.5, 2.0, 3.0, np.pi - 1e-6):
+        axes = rng.normal(size=(6, 3))
+        axes /= np.linalg.norm(axes, axis=1)[:, None]
+        rotations = np.array([pin.exp3(angle * axis) for axis in axes])
+        expected = np.array([pin.log3(rotation) for rotation in rotations])
+        found = _compute_rotation_vectors(rotations.reshape(2, 3, 3, 3))
+        np.testing.assert_allclose(found.reshape(6, 3), expected, atol=1e-9)

@@ -177,3 +177,13 @@ def test_invalid_entries_of_files_are_refused(
     document = {**scene.document, "obstacles": [{"type": "points", "name": "cloud", **entry}]}
     with pytest.raises(vkc.InputError, match=message):
         vkc.Scene.from_document(document, scene.folder)
+
+
+def test_points_have_their_colour(scene: vkc.Scene) -> None:
+    """Viewers take it from the shape, not from a material."""
+    seen = scene.with_points(POINTS, radius=0.02)
+    own = [shape for shape in seen.obstacle_visual if shape.name.startswith("points")]
+    assert own
+    for shape in own:
+        assert shape.overrideMaterial
+        assert shape.meshColor.shape == (4,)

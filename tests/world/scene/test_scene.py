@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+from helpers.drives import make_hall
 from helpers.expected_errors import expect_error
 from helpers.rooms import TINY, load_scene_text
 
@@ -115,3 +116,8 @@ def test_start_is_sampled_with_free_held_objects_only(tmp_path: Path) -> None:
         else:
             with expect_error(r"start\.held\.front"):
                 scene.sample_start(np.random.default_rng(0))
+
+
+def test_scene_is_described_by_what_it_has() -> None:
+    assert repr(load_scene("door")).startswith("<Scene door: husky_ur5e, objects door, ")
+    assert repr(make_hall()).endswith("objects none, 0 obstacles>")

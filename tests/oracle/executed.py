@@ -20,9 +20,10 @@ from typing import Any, NamedTuple
 
 from .judge import find_violations
 from .plan import Violation, read_plan
+from .stage import World
 
 DEEPEST = 1e-3  # [m] of overlaps that count as none
-MISS = 0.01  # [m], [rad] of goals beyond the tolerances of plans
+MISS, ANGULAR_MISS = 0.01, 0.02  # [m], [rad] of goals beyond the tolerances of plans
 
 
 class Comparison(NamedTuple):
@@ -40,14 +41,25 @@ def judge_executed(path: Path, trial: Mapping[str, Any]) -> list[Violation]:
         trial: Its record.
     """
     counting = []
-    for violation in find_violations(read_plan(path)):
+    motion = read_plan(path)
+    world = World(motion)
+    for violation in find_violations(motion):
         clock = violation.time + trial["recorded_since"]
         is_known = clock >= find_begin(violation.subject, trial)
         is_overlap = violation.rule == "overlap" and violation.amount > DEEPEST
-        is_miss = violation.rule == "goal" and violation.amount > MISS
+        allowed = get_allowed_miss(world, violation.subject)
+        is_miss = violation.rule == "goal" and violation.amount > allowed
         if is_miss or (is_overlap and is_known):
             counting.append(violation)
     return counting
+
+
+def get_allowed_miss(world: World, subject: str) -> float:
+    """Return the accepted miss of a goal: of a joint "<object>.<joint>" that turns, or other."""
+    owner, _, joint = subject.partition(".")
+    item = world.objects.get(owner)
+    turns = item is not None and joint in item.state and not item.is_prismatic(joint)
+    return ANGULAR_MISS if turns else MISS
 
 
 def find_begin(subject: str, trial: Mapping[str, Any]) -> float:

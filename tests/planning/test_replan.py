@@ -19,8 +19,8 @@ OPEN = vkc.Actuate("door", {"hinge": 1.2})
 
 
 @cache
-def plan_door() -> vkc.Plan:
-    plan = vkc.plan(vkc.load_scene("door"), [OPEN])
+def plan_door(jerk_time: float = 0.0) -> vkc.Plan:
+    plan = vkc.plan(vkc.load_scene("door"), [OPEN], options=vkc.Options(jerk_time=jerk_time))
     assert plan.success, plan.summary()
     return plan
 
@@ -109,8 +109,10 @@ def test_robot_off_its_path_is_braked_where_it_goes() -> None:
     assert 0.0 < passed[0] < end
 
 
-def test_stop_brakes_on_the_path_within_the_limits() -> None:
-    plan = plan_door()
+@pytest.mark.parametrize("jerk_time", [0.0, 0.1])
+def test_stop_brakes_on_the_path_within_the_limits(jerk_time: float) -> None:
+    """Those of velocities and accelerations, whether jerks of the motion are limited or not."""
+    plan = plan_door(jerk_time)
     motion = plan.trajectory
     dense = motion.at(np.linspace(0.0, motion.times[-1], 20_000))
     for time in np.linspace(0.0, motion.times[-1], 23):

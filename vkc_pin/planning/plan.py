@@ -233,6 +233,9 @@ class Plan:
     def stop(self, time: float, *, scene: Scene | None = None) -> Plan:
         """Return a motion that brakes on this one's path as hard as the limits allow.
 
+        Those of velocities, accelerations and torques: jerks are not limited, since nothing is
+        better than to brake.
+
         Args:
             time: When braking begins [s].
             scene: The world as it is at that time. Default: `scene_at(time)`.
@@ -252,9 +255,10 @@ class Plan:
     def check_stop(self, motion: Trajectory, scene: Scene) -> Plan:
         """Return a braking motion, see `stopping.brake`, as a plan validated in a scene."""
         steps = list_steps_of_stop(self.scene, motion)
-        report = validate(scene, steps, motion, self.options)
+        options = replace(self.options, jerk_time=0.0)
+        report = validate(scene, steps, motion, options)
         status = "success" if report.ok else "rejected"
-        return Plan(scene, steps, self.options, motion, report, status, initialization="stop")
+        return Plan(scene, steps, options, motion, report, status, initialization="stop")
 
     def check_success(self, field: str = "plan") -> None:
         """Raise an `InputError` about a field unless the plan is a success."""

@@ -94,8 +94,8 @@ def test_robot_off_its_path_is_braked_where_it_goes() -> None:
     time = 1.5
     error = np.linspace(-0.01, 0.01, size)
     rate = np.linspace(0.02, -0.01, size)
-    stop = brake(plan.scene, motion, time, plan.options, error=error, error_rate=rate)
-    on_path = brake(plan.scene, motion, time, plan.options)
+    stop = brake(plan.scene, motion, time, error=error, error_rate=rate)
+    on_path = brake(plan.scene, motion, time)
     np.testing.assert_array_equal(stop.times, on_path.times)
     np.testing.assert_allclose(stop.at(0.0)[:size], motion.at(time)[:size] + error, atol=1e-9)
     expected = motion.velocity(time)[:size] + rate

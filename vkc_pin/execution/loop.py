@@ -441,7 +441,7 @@ class _Loop:
     def _make_stop(self, motion_time: float) -> Trajectory:
         """Return the motion that brakes from a time of the present motion on [s]."""
         plan = self._plan
-        return brake(plan.scene, plan.trajectory, motion_time, plan.options)
+        return brake(plan.scene, plan.trajectory, motion_time)
 
     def _brake(
         self, reason: str, *, error: Floats | None = None, pulls: bool = False
@@ -476,7 +476,6 @@ class _Loop:
                 plan.scene,
                 plan.trajectory,
                 motion_time,
-                plan.options,
                 error=error + error_rate * (motion_time - measured),
                 error_rate=error_rate,
             )

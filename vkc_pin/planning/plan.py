@@ -250,7 +250,7 @@ class Plan:
         self.check_success()
         time = self.check_time(time)
         now = self.scene_at(time) if scene is None else check_instance(scene, Scene, "scene")
-        return self.check_stop(brake(self.scene, self.trajectory, time, self.options), now)
+        return self.check_stop(brake(self.scene, self.trajectory, time), now)
 
     def check_stop(self, motion: Trajectory, scene: Scene) -> Plan:
         """Return a braking motion, see `stopping.brake`, as a plan validated in a scene."""

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from vkc_pin.options import Options
 from vkc_pin.planning.retiming.limits import Limits
 from vkc_pin.utils.arrays import Floats
 from vkc_pin.world.scene.scene import Scene
@@ -29,7 +28,6 @@ def brake(
     scene: Scene,
     motion: Trajectory,
     time: float,
-    options: Options,
     *,
     error: ArrayLike = 0.0,
     error_rate: ArrayLike = 0.0,
@@ -52,14 +50,13 @@ def brake(
         scene: Scene of the motion.
         motion: Smooth motion within the limits.
         time: Time at which braking begins [s].
-        options: Options of planning.
         error: Distance of the robot from the path then, shape (n,), [m] and [rad].
         error_rate: Its rate, shape (n,), [m/s] and [rad/s].
 
     Returns:
         The motion from `time` on, which counts from 0.
     """
-    limits = Limits.from_scene(scene, motion.names, options.jerk_time)
+    limits = Limits.from_scene(scene, motion.names, jerk_time=0.0)
     limit = _SHARE * limits.acceleration
     places = _choose_places(motion, time)
     velocity = motion.velocity(places)

@@ -50,6 +50,23 @@ def test_object_that_is_elsewhere_is_touched_before_its_grasp(door_plan: vkc.Pla
     assert finding == "door is elsewhere"
     assert 0.0 < touched < closing
     assert monitor.check_world(0.0, displace(8.0)) == ("door is elsewhere", np.inf)
-    # What is in the hand is always near.
+    # The hand is always near to an object that it holds.
     end = float(motion.times[-1])
     assert monitor.check_world(end - 0.1, displace(-0.03)) == ("door is elsewhere", np.inf)
+
+
+def test_all_objects_that_are_elsewhere_count() -> None:
+    """The first one is far from the path now, another one on it."""
+    plan = vkc.plan(vkc.load_scene("tray"), [vkc.GoTo(-1.0, 0.8)])
+    assert plan.success, plan.summary()
+    first, second = list(plan.scene.objects)[:2]
+    monitor = Monitor(plan)
+    away = plan.scene.objects[first].placement.copy()
+    away.translation[0] += 20.0
+    scene = plan.scene.with_placement(first, away)
+    assert monitor.check_world(0.0, scene) == (f"{first} is elsewhere", np.inf)
+    middle = plan.trajectory.at(float(plan.trajectory.times[-1]) / 2.0)
+    on_path = pin.SE3(np.eye(3), np.array([*middle[:2], 0.3]))
+    finding, touched = monitor.check_world(0.0, scene.with_placement(second, on_path))
+    assert finding == f"{first} is elsewhere"
+    assert touched < plan.trajectory.times[-1]

@@ -51,21 +51,20 @@ class Monitor:
         """
         if scene is None:
             return "", np.inf
-        moved = self._find_moved_object(scene)
+        moved = self._find_moved_objects(scene)
         # Objects that are where the plan has them, to within tolerances, are there exactly.
         known = replace(scene, objects=self.plan.scene.objects)
-        if moved:
-            known = self._add_moved_object(known, scene, moved, time)
-            return f"{moved} is elsewhere", self._check.check(known, time).clear_until
+        for name in moved:
+            known = self._add_moved_object(known, scene, name, time)
         found = self._check.check(known, time)
-        if not found.violations:
-            return "", np.inf
-        return found.violations[0].subject, found.clear_until
+        if moved:
+            return f"{moved[0]} is elsewhere", found.clear_until
+        if found.violations:
+            return found.violations[0].subject, found.clear_until
+        return "", np.inf
 
     def _add_moved_object(self, known: Scene, scene: Scene, name: str, time: float) -> Scene:
-        """Return a scene that has an object, where it is now, among its obstacles.
-
-        Not one in the hand, which is always near.
+        """Return a scene that has a displaced object among its obstacles, unless the hand holds it.
 
         Args:
             known: Scene to which it is added.
@@ -73,8 +72,7 @@ class Monitor:
             name: The object.
             time: Time of the motion [s].
         """
-        motion = self.plan.trajectory
-        holds = find_phase_at(motion, time).holds
+        holds = find_phase_at(self.plan.trajectory, time).holds
         if name in [hold.object for hold in holds]:
             return known
         state = self.plan.scene_at(time).objects[name].state
@@ -96,13 +94,14 @@ class Monitor:
         unit = coordinates.units[worst]
         return f"{coordinates.names[worst]} is {errors[worst]:.3g} {unit} off"
 
-    def _find_moved_object(self, scene: Scene) -> str:
-        """Return the name of an object that is not where the plan has it; "" if all are."""
+    def _find_moved_objects(self, scene: Scene) -> list[str]:
+        """Return the names of the objects that are not where the plan has them."""
+        moved = list[str]()
         for name, placed in self.plan.scene.objects.items():
             displacement = placed.placement.actInv(scene.objects[name].placement)
             distance = float(np.linalg.norm(displacement.translation))
             angle = float(np.linalg.norm(pin.log3(displacement.rotation)))
             most, most_angle = _FREE_TOLERANCES if placed.object.free else _TOLERANCES
             if distance > most or angle > most_angle:
-                return name
-        return ""
+                moved.append(name)
+        return moved

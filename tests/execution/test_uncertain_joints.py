@@ -54,7 +54,7 @@ def find_margin(scene: vkc.Scene) -> float | None:
     [(0.05, None), (0.015, 0.0), (0.003, 0.0), (-0.003, -0.004), (-0.02, None)],
 )
 def test_leaf_may_come_near_on_its_way(gap: float, margin: float | None) -> None:
-    """But not overlap what it meets by more than an error of the model."""
+    """But it may not overlap a neighbour by more than an error of the model."""
     scene = make_scene(gap)
     assert find_margin(scene) is None
     allowed = allow_near_neighbours(scene, "door", "hinge", STEPS, SAFE)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.experiments import run_experiment
-from oracle.executed import judge_executed
+from oracle.executed import judge_motion
 
 import vkc_pin as vkc
 from vkc_pin.experiments.closed_loop import ROWS, _disturb, _Localisation
@@ -63,8 +63,9 @@ def test_undisturbed_plan_is_executed_open_and_closed_loop(tmp_path: Path) -> No
 
 def check_oracle(folder: Path, trial: Mapping[str, Any]) -> None:
     """Check that the oracle finds nothing in a real motion, and something in a changed one."""
-    path = folder / "motions" / f"{trial['key']}.npz"
-    assert judge_executed(path, trial) == []
+    path = folder / trial["motion"]
+    assert path.name == "nothing_drawer_0000.npz"
+    assert judge_motion(path, trial).found == []
     real = vkc.Plan.load(path)
     motion = real.trajectory
     positions = motion.positions.copy()
@@ -73,16 +74,16 @@ def check_oracle(folder: Path, trial: Mapping[str, Any]) -> None:
     positions[motion.phases[1].first + 20, :2] = at[:2]  # the base overlaps the drawer
     changed = dataclasses.replace(motion, positions=positions)
     wrong = dataclasses.replace(real, trajectory=changed).save(folder / "wrong.npz")
-    found = judge_executed(wrong, trial)
+    found = judge_motion(wrong, trial).found
     assert ("goal", "drawer.slide") in {(one.rule, one.subject) for one in found}
     overlaps = [one for one in found if one.rule == "overlap"]
     assert any("drawer" in one.subject for one in overlaps)
     # What touches an object before its place is known does not count.
     unknown = {**trial, "object": "drawer", "object_since": None}
-    left = [one for one in judge_executed(wrong, unknown) if one.rule == "overlap"]
+    left = [one for one in judge_motion(wrong, unknown).found if one.rule == "overlap"]
     assert not any("drawer" in one.subject for one in left)
     unknown = {**trial, "robot_since": None}
-    assert {one.rule for one in judge_executed(wrong, unknown)} == {"goal"}
+    assert {one.rule for one in judge_motion(wrong, unknown).found} == {"goal"}
 
 
 @pytest.mark.parametrize("row", ["displaced", "grasp"])

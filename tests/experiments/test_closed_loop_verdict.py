@@ -75,7 +75,7 @@ def cup_plan() -> vkc.Plan:
         (Knowledge("cup", 2.0), make_contact(FINGER, "cup.cup", 1.9), False),
         (Knowledge("cup", 2.0), make_contact("cup.cup", FINGER, 2.0), True),
         (Knowledge("cup", np.inf), make_contact(FINGER, "cup.cup", 9.0), False),
-        # Other things are where they are, and the robot, too.
+        # The places of other obstacles and of the robot are known.
         (Knowledge("cup", np.inf), make_contact("base_link", "sofa", 0.1), True),
         (Knowledge("cup", 1.0, 3.0), make_contact("base_link", "sofa", 2.9), False),
         (Knowledge("cup", 1.0, 3.0), make_contact(FINGER, "cup.cup", 3.1), True),

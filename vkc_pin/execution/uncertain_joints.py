@@ -1,4 +1,4 @@
-"""Lets links of estimated joints come near to what is beside them."""
+"""Lets links of estimated joints come near to their neighbours."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vkc_pin.world.scene.placed_object import PlacedObject
 from vkc_pin.world.scene.scene import Scene
 from vkc_pin.world.task.steps import Actuate, Step
 
-_PARTS = 20  # of the way of a joint to its goal
+_PARTS = 20  # steps of a joint to its goal
 
 
 def allow_near_neighbours(

@@ -130,7 +130,7 @@ def run(
         tasks: Some of `TASKS`. Default: all.
         rows: Some of `ROWS`. Default: all.
         save_motions: Whether to save how the robots really moved in the closed loop, as plans
-            `out`/motions/KEY.npz in the world as it really was.
+            `out`/motions/ROW_TASK_NUMBER.npz in the world as it really was.
     """
     import_mujoco()
     runner.check_positive(trials=trials)
@@ -187,8 +187,8 @@ def format_results(result: Mapping[str, Any]) -> str:
         "# Plans in a world that differs",
         f"{about['starts']} random starts per row and task, seed {about['seed']}, "
         f"{describe_limit(about)} each. Robots in physics are judged by their real motions: "
-        "goals within 10 mm and 0.02 rad, grasps that last, and no collision with what was known "
-        "at that time that the motion does not have in the world of its plan, and that is deeper "
+        "goals within 10 mm and 0.02 rad, grasps that last, and no collision that the robot could "
+        "know of, that the motion does not have in the world of its plan, and that is deeper "
         "than 1 mm or pushes a free object further. Time passes for the robot while the program "
         "computes. Latencies are the median and the 95th percentile of cycles that "
         "planned again; cycles are those that kept 20 Hz.",
@@ -279,9 +279,10 @@ def _record(spec: dict[str, Any], *, motions: Path | None) -> dict[str, Any]:
         reasons.insert(0, result.reason)
     fields |= _describe("closed", robot, reasons, depth)
     if motions is not None:
-        path = motions / f"{spec['key']}.npz"
-        path.parent.mkdir(parents=True, exist_ok=True)
+        motions.mkdir(parents=True, exist_ok=True)
+        path = motions / f"{row}_{spec['task']}_{spec['number']:04d}.npz"
         _make_executed_plan(found, robot, disturbance.actual).save(path)
+        fields["motion"] = f"{motions.name}/{path.name}"
     fields |= {
         "recorded_since": float(robot.trajectory().times[0]),
         "object": known.object,

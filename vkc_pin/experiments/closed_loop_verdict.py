@@ -1,4 +1,4 @@
-"""Judges how robots really moved in physics: goals, grasps, and collisions with what was known."""
+"""Judges real motions of robots in physics: goals, grasps, and collisions that were avoidable."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _FAR = 1.5  # [m] from a person to the origin of a shape; none is larger
 _MOVING = 0.02  # [m/s] or [rad/s]; slower, a robot stands, and who walks into it does so himself
 _REACHED = {"m": 0.01, "rad": 0.02}  # accepted miss of a goal, as in `execution`
 _DEEPEST = 1e-3  # [m] of collisions that count as none
-_SETTLING = 0.1  # [s] after a contact, in which what was pushed still moves
+_SETTLING = 0.1  # [s] after a contact, in which a pushed object still moves
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def judge_execution(
         found: The plan whose goals count.
         robot: The robot, which has come to rest.
         sent: Begin on the robot's clock [s] and plan of all motions that were sent.
-        knowledge: What the program could know.
+        knowledge: Since when the program knew of differences.
         person: Somebody who moved there.
 
     Returns:

@@ -40,7 +40,7 @@ _FREE_ENTRIES = {"name", "obstacles", "objects", "start_region"}
 
 
 class RemainingResult(NamedTuple):
-    """What a check of the rest of a motion finds.
+    """Result of a check of the rest of a motion.
 
     Attributes:
         violations: See `RemainingCheck.find_violations`.

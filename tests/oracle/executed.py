@@ -14,6 +14,7 @@ import argparse
 import json
 import math
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,7 @@ def judge_motion(path: Path, trial: Mapping[str, Any]) -> Verdict:
         path: The motion.
         trial: Its record.
     """
+    start_time = time.perf_counter()
     motion = read_plan(path)
     world = World(motion)
     counting = list[Violation]()
@@ -47,7 +49,9 @@ def judge_motion(path: Path, trial: Mapping[str, Any]) -> Verdict:
             counting.append(violation)
     reason = trial["closed_reason"]
     status = "failure" if reason else "success"
-    return Verdict(path, trial["closed"], status, [reason] if reason else [], counting)
+    verdict = Verdict(path, trial["closed"], status, [reason] if reason else [], counting)
+    verdict.seconds = time.perf_counter() - start_time
+    return verdict
 
 
 def get_allowed_miss(world: World, subject: str) -> float:
@@ -60,11 +64,11 @@ def get_allowed_miss(world: World, subject: str) -> float:
 
 def find_begin(subject: str, trial: Mapping[str, Any]) -> float:
     """Return when the places of two links, "one - other", and of the robot became known [s]."""
-    times = [trial["robot_since"]]
+    since = [trial["robot_since"]]
     owners = [label.partition(".")[0] for label in subject.split(" - ")]
     if trial["object"] in owners:
-        times.append(trial["object_since"])
-    return max(math.inf if time is None else time for time in times)
+        since.append(trial["object_since"])
+    return max(math.inf if moment is None else moment for moment in since)
 
 
 def judge_trials(folder: Path) -> list[Verdict]:
